@@ -7,10 +7,11 @@ every step: the address of a row of noise or of a report, or a counter.
 A tile of lanes passes through all steps before the next tile begins, so that it stays in the processor's cache.
 """
 
+import ctypes
 import functools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy
@@ -273,6 +274,14 @@ class CallSequence:
         if trial:
             self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
             self._tries += 1
+
+    def call(self, width: int) -> Callable[[], None]:
+        """Return a call without arguments that runs all steps over all lanes, in half the time of :meth:`run`.
+
+        The caller keeps the sequence, and calls :meth:`expect` before the first run and once in a while.
+        """
+        lanes = ctypes.c_int64(0), ctypes.c_int64(width)
+        return functools.partial(_driver(), ctypes.c_void_p(address_of(self._given)), *lanes)
 
     def count_with(self, other: "CallSequence") -> None:
         """Share the count of lanes with another sequence of the same code on other memory."""

@@ -10,7 +10,7 @@ import numpy
 
 from ..baselines.problem import Problem
 from ..baselines.state_space import state_space_baselines
-from ..compiler.functions import CompiledFunction, map_arrays
+from ..compiler.functions import map_arrays
 from ..envs.contract.filter import FilterInput, Initial
 from ..envs.data.recorded_world import Feed
 from ..envs.engine.backend import make_model
@@ -25,7 +25,7 @@ from ..filters.angles import shorten
 from ..filters.array_namespace import select_nested
 from ..own_models import state_space
 from .models import EnvironmentModel
-from .readings import EnvironmentSensor
+from .readings import EnvironmentSensor, Readings
 from .recursions import Array, Recursion
 
 PARTS = ("observation", "mean", "deviation", "nis", "innovation")
@@ -113,13 +113,12 @@ class Estimates(Recursion):
 
     Args:
         model: of the environment.
-        sensors: that read its state.
+        readings: of its state.
         competitor: name of an estimator of a state-space model, such as ``"extended"``, or what makes one.
         control: ``"noise"`` or ``"gain"``: an action multiplies these of the filter as written, in place of a
             competitor; None: nothing does.
         show: words of :data:`PARTS`.
         actions: space of the environment's actions.
-        lanes: N.
 
     Attributes:
         action_space: of the control; None without.
@@ -132,33 +131,26 @@ class Estimates(Recursion):
     def __init__(
         self,
         model: EnvironmentModel,
-        sensors: Mapping[str, EnvironmentSensor],
+        readings: Readings,
         competitor: Any,
         control: str | None,
         show: tuple[str, ...],
         actions: gymnasium.Space[Any],
-        lanes: int,
     ) -> None:
-        super().__init__((model, sensors, competitor, control, show, actions, lanes), lanes)
-        self._model, self._show = model, show
+        super().__init__((model, readings, competitor, control, show, actions), readings.lanes)
+        self._model, self._show, self._readings = model, show, readings
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
-        self._filter = own = _make_filter(define_problem(model, sensors), competitor, control, lanes)
+        problem = define_problem(model, readings.sensors)
+        self._filter = own = _make_filter(problem, competitor, control, readings.lanes)
         self.action_space: Any = None if control is None else own.action_space
-        self._behind = max(one.delay for one in sensors.values())
-        n, m, p, width = (
-            len(model.names),
-            own.task.definition.filters[0].h.size,
-            len(model.inputs),
-            self.width,
-        )
+        self._behind = max(one.delay for one in readings.sensors.values())
+        n, m, p, width = len(model.names), len(readings.complete) // 2, len(model.inputs), self._width
         self._kind = actions.dtype if p else None
-        self._complete, self._actions, self._own = (
-            numpy.zeros((*shape, width))
-            for shape in ((2 * m,), actions.shape if p else (), own.action_space.shape)
-        )
-        self._places = self.rows(self._actions), self.rows(self._own)
-        zeros = numpy.zeros((n + m + p, width))
+        taken = numpy.zeros((width, *(actions.shape or ()) * (p > 0)))
+        steered = numpy.zeros((*(own.action_space.shape or ()), width))
+        self._places = taken[self.own], steered.T[self.own]
+        zeros = numpy.zeros((n + m, width))
         estimate = Estimate(zeros[:n], zeros[:n], zeros[0], zeros[:m])
         inputs = numpy.zeros((self._behind, p, width)) if p and self._behind else None
         self._first: Any = map_arrays(lambda one: one[..., :1], own.start_filter(self._initial))
@@ -167,45 +159,40 @@ class Estimates(Recursion):
         state = FilterState(zeros[0], begun, inputs, estimate)
         traced, step = None, functools.partial(self._step_of, own)
         if isinstance(own, CompiledModel) and not own.filter.in_python:
-            of_traced = functools.partial(self._step_of, own.programs.traced)
-            traced = CompiledFunction(of_traced, own.programs.graph, turned=True, unchanged=0)
-        self.bind(step, traced, state, (self._complete, self._actions, self._own))
+            traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
+        self.bind(step, traced, state, taken, [readings.complete, steered])
         self.shown: Array = self.outputs[0][self.own]
 
     @property
     def _initial(self) -> Initial:
-        mean, covariance = (
-            numpy.array(self._model.mean, dtype=float)[:, None],
-            self._model.matrix("covariance")[:, :, None],
-        )
-        return Initial(*(numpy.repeat(one, self.width, axis=-1) for one in (mean, covariance)))
+        mean = numpy.array(self._model.mean, dtype=float)[:, None]
+        parts = mean, self._model.matrix("covariance")[:, :, None]
+        return Initial(*(numpy.repeat(one, self._width, axis=-1) for one in parts))
 
     @property
     def estimate(self) -> Estimate:
         """Copy of the last estimates."""
         return Estimate(*(one[..., : self.lanes].T for one in self.state.estimate))
 
-    def advance(
-        self, complete: Array, actions: Any, own: Any, begins: Array | None, steps: Array | None
-    ) -> None:
-        """Take in the readings of a step.
+    def act(self, action: Any, own: Any) -> None:
+        """Set the actions of all lanes in the next step, of the environment and of the control; None without."""
+        self._places[0][...] = action
+        if own is not None:
+            self._places[1][...] = own
 
-        Args:
-            complete: readings of one time: :attr:`.Readings.complete`.
-            actions: of all lanes that acted in the step; None: of a reset.
-            own: of the control; None: zero.
-            begins: whose episodes begin, booleans ``(N,)``.
-            steps: which go on, booleans ``(N,)``; None: no lane begins and all go on.
-        """
-        self._complete[...] = complete
-        if actions is not None:
-            self._places[0][...] = actions
-            if own is not None:
-                self._places[1][...] = own
+    def take(self, begins: Array | None, steps: Array | None, complete: Array | None) -> None:
+        """Take in the last readings, or ``complete`` ones of before; lanes as in :meth:`.Recursion.run`."""
+        if complete is not None:
+            last = self._readings.complete.copy()
+            self._readings.complete[...] = complete
+        if begins is not None and self._filter.filter.in_python:
+            self._filter.start_filter(self._initial)  # its memory
         self.run(begins, steps)
+        if complete is not None:
+            self._readings.complete[...] = last
 
-    def _step_of(self, model: Any, state: FilterState, given: Any) -> tuple[FilterState, tuple[Array]]:
-        begins, steps, complete, actions, own = given
+    def _step_of(self, model: Any, given: Any, state: FilterState) -> tuple[FilterState, tuple[Array]]:
+        actions, begins, steps, complete, own = given
         xp, own_model, equations = model.task.xp, self._model, model.task.filter_equations[0]
         begins, n, m = begins > 0.0, len(own_model.names), complete.shape[0] // 2
         is_active, values, available = begins | (steps > 0.0), complete[:m], complete[m:]

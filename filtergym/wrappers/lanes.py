@@ -12,12 +12,16 @@ from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
 from .readings import EnvironmentSensor, Reading, Readings, read_sensors
 
 
+STEP = [(None, None, None)]
+"""Events of a step of all lanes."""
+
+
 class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     """Sensors of the lanes of an environment."""
 
-    events: list[tuple[numpy.ndarray | None, numpy.ndarray | None, numpy.ndarray]]
+    events: list[tuple[Any, Any, Any]]
     """Of the last step or reset, what a filter takes in: which lanes begin an episode and which go on, booleans
-    ``(N,)``, None: none and all; and :attr:`.Readings.complete`."""
+    ``(N,)``, None: none and all; and copies of :attr:`.Readings.complete` where a further event follows, else None."""
 
     def __init__(self, env: Any, sensors: Any, model: Any = None) -> None:
         super().__init__(sensors=sensors, model=model, _disable_deepcopy=True)
@@ -44,10 +48,14 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     def _read(
         self, observations: Any, begins: Any = None, steps: Any = None, seeds: Any = None
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Read the sensors, see :meth:`.Readings.read`; return the readings and whether they are received."""
+        """Return the readings of a step, see :meth:`.Recursion.run`, and whether they are received."""
         readings = self._readings
-        readings.read(observations, begins, steps, seeds)
-        self.events = [(begins, steps, readings.complete)]
+        readings.place[...] = observations
+        self.events = STEP
+        if begins is not None:
+            readings.name_episodes(begins, steps, seeds)
+            self.events = [(begins, steps, None)]
+        readings.run(begins, steps)
         return readings.values.astype(self._dtype), readings.available.astype(bool)
 
 
@@ -64,12 +72,12 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
     ) -> None:
         given = {"model": model, "competitor": competitor, "show": show, "control": control}
         super().__init__(**given, _disable_deepcopy=True)
-        space, actions, lanes = _wrap(self, env)
+        _, actions, _ = _wrap(self, env)
         self._sensors: SensorLanes = find_sensors(env)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model: EnvironmentModel = check_model(found, self._sensors, actions)
-        kept = competitor, control, check_shown(show, self.model), actions, lanes
-        self._estimates: Estimates = Estimates(self.model, self._sensors.sensors, *kept)
+        kept = competitor, control, check_shown(show, self.model), actions
+        self._estimates: Estimates = Estimates(self.model, self._sensors._readings, *kept)
         joined = joint_space(actions, self._estimates.action_space)
         self._joins, self._own_actions = isinstance(joined, gymnasium.spaces.Box), actions
         self._dtype: Any = self._sensors._dtype
@@ -82,20 +90,23 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
         """The last estimates of all lanes, not rounded to the type of the observation."""
         return self._estimates.estimate
 
-    def _split(self, action: Any) -> tuple[Any, Any]:
-        """Return the environment's action, and that of the filter behind it on the last axis; None without control."""
-        if self._estimates.action_space is None:
-            return action, None
-        if not self._joins:
-            return action
-        count, joined = self._own_actions.shape[-1], numpy.asarray(action)  # type: ignore[index]
-        return joined[..., :count], joined[..., count:]
+    def _act(self, action: Any) -> Any:
+        """Set the actions of a step, and return the environment's; that of the filter is behind it on the last axis."""
+        own, estimates = None, self._estimates
+        if estimates.action_space is not None:
+            if self._joins:
+                joined, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
+                action, own = joined[..., :count], joined[..., count:]
+            else:
+                action, own = action
+        estimates.act(action, own)
+        return action
 
-    def _take(self, actions: Any, own: Any) -> list[numpy.ndarray]:
-        """Take in the readings of a step, or of a reset without actions; return the observations after each event."""
+    def _take(self) -> list[numpy.ndarray]:
+        """Take in the readings of a step or reset; return the observations after each event."""
         shown, estimates = [], self._estimates
         for begins, steps, complete in self._sensors.events:
-            estimates.advance(complete, actions, own, begins, steps)
+            estimates.take(begins, steps, complete)
             shown.append(estimates.shown.astype(self._dtype))
         return shown
 

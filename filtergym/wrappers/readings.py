@@ -16,7 +16,6 @@ import numpy
 
 from ..compiler.counter_code import bind_numbers
 from ..compiler.counter_numbers import numbers
-from ..compiler.functions import CompiledFunction
 from ..compiler.library import portable_library
 from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
@@ -164,6 +163,7 @@ class Readings(Recursion):
         limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
         values: of the last step, ``(m,)`` of one lane, ``(N, m)`` of several.
         available: 1 where they were received, else 0; of the same shape.
+        place: where observations are written before a step, ``(fields,)`` or ``(N, fields)``.
         complete: readings of the last time of which those of all sensors, the slowest too, have been received, and
             behind them 1 where they were made, ``(2 m, W)``.
     """
@@ -176,7 +176,8 @@ class Readings(Recursion):
         lanes: int,
     ) -> None:
         super().__init__((sensors, model, fields, lanes), lanes)
-        self._model, size = model, fields if model is None else len(model.names)
+        self.sensors, self._model = sensors, model
+        size = fields if model is None else len(model.names)
         self._interval: float = 1.0 if model is None else model.interval
         self._functions = [
             trace_measurement(f"h of the sensor {key!r}", sensors[key].h, size, 0) for key in sensors
@@ -194,7 +195,7 @@ class Readings(Recursion):
         self._delays = [one.delay for one in each]
         self._periods = {i: PERIODS[one.wraps] for i, one in enumerate(each) if one.wraps}
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
-        m, width, is_biased = len(each), self.width, bool(self._bias.any())
+        m, width, is_biased = len(each), self._width, bool(self._bias.any())
         self.limit: Array = numpy.array(
             [numpy.nextafter(0.5 * self._periods.get(i, numpy.inf), numpy.inf) for i in range(m)]
         )
@@ -204,57 +205,38 @@ class Readings(Recursion):
         """Identities of the episodes and steps of their numbers, see :mod:`.counter_numbers`."""
         self._counts = m * (1 + is_biased), len(sensors) * (not self._is_steady)
         """Of normal and of uniform numbers."""
-        self._observation, self._numbers = (
-            numpy.zeros((fields, width)),
-            numpy.zeros((sum(self._counts), width)),
-        )
+        self._numbers = numpy.zeros((sum(self._counts), width))
         self._ahead: list[Array] = []
         """Numbers of coming steps, the last ones first."""
         zeros, late = numpy.zeros((m, width)), numpy.zeros((max(self._delays), 2, m, width))
         state = SensorState(zeros[0], zeros, zeros if is_biased else None, late if len(late) else None)
-        draw: Any = self._draw
+        draw, library = self._draw, None
         if AVAILABLE:
             draw = bind_numbers(self._identities, self._times, self._numbers, self._counts[0])
-        traced = CompiledFunction(self._step_of, Graph(), turned=True, unchanged=0)
-        self.bind(
-            self._step_of,
-            traced,
-            state,
-            (self._observation, self._numbers),
-            [draw],
-            AVAILABLE and portable_library() or None,
-        )
-        self._place = self.rows(self._observation)
+            library = portable_library()
+        observation, traced = numpy.zeros((width, fields)), (self._step_of, Graph())
+        self.bind(self._step_of, traced, state, observation, [self._numbers], [draw], library)
         self.complete, available, values = self.outputs
-        self.values, self.available = values[self.own], available.T[self.own]
+        self.place, self.values, self.available = observation[self.own], values[self.own], available.T[self.own]
 
-    def read(
-        self, observations: Array, begins: Array | None = None, steps: Array | None = None, seeds: Any = None
-    ) -> None:
-        """Read the sensors a step later.
+    def name_episodes(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None) -> None:
+        """Set whose noise the next step has.
 
         Args:
-            observations: of all lanes.
-            begins: whose episodes begin, booleans ``(N,)``; readings are received at once, but for the delay.
-            steps: which go on, booleans ``(N,)``; others keep their last readings. None: no lane begins and all go on.
+            begins: whose episodes begin, booleans ``(N,)``.
+            steps: which go on, booleans ``(N,)``.
             seeds: of the episodes of all lanes; None, of all or of one: it goes on with its next episode, at first of a
                 random seed.
         """
-        self._place[...] = observations
-        if begins is not None:
-            given: Sequence[int | None] = [None] * self.lanes if seeds is None else seeds
-            for lane in numpy.flatnonzero(begins).tolist():
-                seed = given[lane]
-                if seed is None and self._is_seeded[lane]:
-                    self._identities[1, lane] += numpy.uint64(1)
-                else:
-                    drawn = (
-                        int(numpy.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
-                    )
-                    self._identities[:, lane], self._is_seeded[lane] = [drawn ^ STREAM << 32, 0], True
-            own, self._ahead = self._times[: self.lanes], []
-            own[:] = numpy.where(begins, -1, own - ~(begins | steps))  # the call adds one
-        self.run(begins, steps)
+        for lane in numpy.flatnonzero(begins).tolist():
+            seed = None if seeds is None else seeds[lane]
+            if seed is None and self._is_seeded[lane]:
+                self._identities[1, lane] += numpy.uint64(1)
+            else:
+                drawn = int(numpy.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
+                self._identities[:, lane], self._is_seeded[lane] = [drawn ^ STREAM << 32, 0], True
+        own, self._ahead = self._times[: len(begins)], []
+        own[:] = numpy.where(begins, -1, own - ~(begins | steps))  # the call adds one
 
     def _draw(self, first: int, last: int) -> None:
         """Make the numbers of a step without a compiler."""
@@ -267,8 +249,10 @@ class Readings(Recursion):
     def _arrays(self) -> list[Array]:
         return [*super()._arrays(), self._identities, self._times, self._is_seeded]
 
-    def _step_of(self, state: SensorState, given: tuple[Array, ...]) -> tuple[SensorState, tuple[Array, ...]]:
-        begins, steps, x, normals = given
+    def _step_of(
+        self, given: tuple[Array, ...], state: SensorState
+    ) -> tuple[SensorState, tuple[Array, ...]]:
+        x, begins, steps, normals = given
         xp, m = namespace(x), len(self._delays)
         begins, uniforms = begins > 0.0, normals[self._counts[0] :]
         is_active = begins | (steps > 0.0)

@@ -74,13 +74,12 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin episodes, and the filters of these lanes."""
         _, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        return self._take(None, None)[-1], infos
+        return self._take()[-1], infos
 
     def step(self, actions: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
         """Step the environments, and take their readings in."""
-        actions, own = self._split(actions)
-        _, rewards, terminations, truncations, infos = self.env.step(actions)
-        *finals, last = self._take(actions, own)
+        _, rewards, terminations, truncations, infos = self.env.step(self._act(actions))
+        *finals, last = self._take()
         if finals:
             infos = {**infos, "final_obs": rows_of(infos["_final_obs"], finals[0])}
         return last, rewards, terminations, truncations, infos
