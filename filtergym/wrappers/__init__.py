@@ -85,10 +85,9 @@ class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin an episode, and the filter with its first readings."""
         _, info = self.env.reset(seed=seed, options=options)
-        return self._take()[0], info
+        return self._estimates.shown.astype(self._dtype), info
 
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and take its readings in."""
-        action = self._act(action)
-        _, reward, terminated, truncated, info = self.env.step(action)
-        return self._take()[0], reward, terminated, truncated, info
+        _, reward, terminated, truncated, info = self.env.step(self._act(action))
+        return self._estimates.shown.astype(self._dtype), reward, terminated, truncated, info

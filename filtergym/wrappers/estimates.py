@@ -123,6 +123,7 @@ class Estimates(Recursion):
     Attributes:
         action_space: of the control; None without.
         shown: what is shown, ``(fields,)`` of one lane, ``(N, fields)`` of several.
+        final: the same before episodes began in the same step.
 
     Raises:
         ValueError: for an unknown competitor or control, or a model that cannot be one.
@@ -137,8 +138,8 @@ class Estimates(Recursion):
         show: tuple[str, ...],
         actions: gymnasium.Space[Any],
     ) -> None:
-        super().__init__((model, readings, competitor, control, show, actions), readings.lanes)
-        self._model, self._show, self._readings = model, show, readings
+        super().__init__((model, readings, competitor, control, show, actions), readings.lanes, readings)
+        self._model, self._show = model, show
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
         problem = define_problem(model, readings.sensors)
@@ -162,6 +163,7 @@ class Estimates(Recursion):
             traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
         self.bind(step, traced, state, taken, [readings.complete, steered])
         self.shown: Array = self.outputs[0][self.own]
+        self.final: Array = self.shown
 
     @property
     def _initial(self) -> Initial:
@@ -180,21 +182,12 @@ class Estimates(Recursion):
         if own is not None:
             self._places[1][...] = own
 
-    def take(self, begins: Array | None, steps: Array | None, complete: Array | None) -> None:
-        """Take in the last readings, or ``complete`` ones of before; lanes as in :meth:`.Recursion.run`."""
-        if complete is not None:
-            last = self._readings.complete.copy()
-            self._readings.complete[...] = complete
-        if begins is not None and self._filter.filter.in_python:
-            self._filter.start_filter(self._initial)  # its memory
-        self.run(begins, steps)
-        if complete is not None:
-            self._readings.complete[...] = last
-
     def _step_of(self, model: Any, given: Any, state: FilterState) -> tuple[FilterState, tuple[Array]]:
         actions, begins, steps, complete, own = given
         xp, own_model, equations = model.task.xp, self._model, model.task.filter_equations[0]
         begins, n, m = begins > 0.0, len(own_model.names), complete.shape[0] // 2
+        if model.filter.in_python and begins.any():
+            model.start_filter(self._initial)  # it keeps its memory itself
         is_active, values, available = begins | (steps > 0.0), complete[:m], complete[m:]
         step = xp.where(begins, 0.0, state.step + 1.0)
         is_moving = is_active & (step > float(self._behind))

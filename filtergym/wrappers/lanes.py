@@ -12,16 +12,8 @@ from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
 from .readings import EnvironmentSensor, Reading, Readings, read_sensors
 
 
-STEP = [(None, None, None)]
-"""Events of a step of all lanes."""
-
-
 class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     """Sensors of the lanes of an environment."""
-
-    events: list[tuple[Any, Any, Any]]
-    """Of the last step or reset, what a filter takes in: which lanes begin an episode and which go on, booleans
-    ``(N,)``, None: none and all; and copies of :attr:`.Readings.complete` where a further event follows, else None."""
 
     def __init__(self, env: Any, sensors: Any, model: Any = None) -> None:
         super().__init__(sensors=sensors, model=model, _disable_deepcopy=True)
@@ -51,10 +43,8 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
         """Return the readings of a step, see :meth:`.Recursion.run`, and whether they are received."""
         readings = self._readings
         readings.place[...] = observations
-        self.events = STEP
         if begins is not None:
             readings.name_episodes(begins, steps, seeds)
-            self.events = [(begins, steps, None)]
         readings.run(begins, steps)
         return readings.values.astype(self._dtype), readings.available.astype(bool)
 
@@ -101,14 +91,6 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
                 action, own = action
         estimates.act(action, own)
         return action
-
-    def _take(self) -> list[numpy.ndarray]:
-        """Take in the readings of a step or reset; return the observations after each event."""
-        shown, estimates = [], self._estimates
-        for begins, steps, complete in self._sensors.events:
-            estimates.take(begins, steps, complete)
-            shown.append(estimates.shown.astype(self._dtype))
-        return shown
 
 
 def _wrap(wrapper: Any, env: Any) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any], int]:

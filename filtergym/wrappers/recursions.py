@@ -1,6 +1,6 @@
 """Recursions of parallel lanes in fixed arrays: one native call a step where their functions can be traced."""
 
-import functools
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy
 
 from ..compiler.functions import (
     UNCOUNTED,
+    Call,
     Specialised,
     copy_arrays,
     empty_lanes,
@@ -28,21 +29,27 @@ Array = numpy.ndarray
 class Recursion:
     """A recursion of N lanes (parallel episodes) in arrays ``(..., W)``, W the next multiple of eight.
 
+    A step computes state and outputs from the state before and inputs. There are two memories of the state, used
+    alternately. Where the step function can be traced, a step and those of all followers are one native call.
+
     Args:
         arguments: of the class's constructor, with which a copy is made.
         lanes: N.
+        leader: recursion behind which this one runs at every step, of as many lanes; None: it runs by itself.
 
     Attributes:
         lanes: N.
         own: index of the lanes among W; a single one has no axis.
-        given: array that is written before a step, ``(W, ...)``.
         outputs: arrays that the step function returned last; of the last one the transpose, ``(W, rows)``.
     """
 
-    def __init__(self, arguments: Sequence[Any], lanes: int) -> None:
+    def __init__(self, arguments: Sequence[Any], lanes: int, leader: "Recursion | None" = None) -> None:
         self._arguments, self.lanes, self._width = arguments, lanes, round_up_lanes(lanes)
+        self._leader: Recursion = leader or self
         self.own: Any = 0 if lanes == 1 else slice(lanes), ...
-        self._begins, self._steps = numpy.zeros(self._width), numpy.ones(self._width)
+        if leader is None:
+            self._begins, self._steps = numpy.zeros(self._width), numpy.ones(self._width)
+            self._now, self._left, self.followers = 0, 0, weakref.WeakSet[Recursion]()
 
     def bind(
         self,
@@ -62,56 +69,65 @@ class Recursion:
                 it goes on, else 0.
             traced: the same function and its graph for the compiler; None: it runs with NumPy.
             state: first state, nested tuples.
-            given: first argument, transposed.
-            inputs: further arrays that are written before a step.
+            given: array that is written before a step, ``(W, ...)``; the step function takes it with W last.
+            inputs: further arrays.
             before: calls of a range of lanes that precede every step.
             library: of the compiled functions; default: the fastest.
         """
-        self._step, self._before, self._now, self._left = step, before, 0, 0
-        self.given: Array = given
-        self._inputs = (numpy.moveaxis(given, 0, -1), self._begins, self._steps, *inputs)
-        first, count = leaves(state), iter(range(len(leaves(state))))
-        self._template, self._kinds = map_arrays(lambda _: next(count), state), [one.dtype.kind for one in first]
-        self._states = [[self._memory(one) for one in first] for _ in range(2)]
-        for memory, array in zip(self._states[0], first, strict=True):
-            memory[...] = array
+        leader, first = self._leader, leaves(state)
+        places = iter(range(len(first)))
+        self._step, self._before = step, before
+        self._template, self._kinds = map_arrays(lambda _: next(places), state), [one.dtype.kind for one in first]
+        self._inputs = (numpy.moveaxis(given, 0, -1), leader._begins, leader._steps, *inputs)
         with numpy.errstate(all="ignore"):
             *outputs, last = step(self._inputs, state)[1]
-        self.outputs: list[Array] = [*map(self._memory, outputs), numpy.zeros(last.shape[::-1])]
-        self._runs: list[Callable[[], None]] = [self._run_step] * 2
-        self._sequences: list[CallSequence] = []
-        if traced is None or not AVAILABLE:
-            return
-        try:
-            special = Specialised(*traced, (self._inputs, state), True, 0, True)
-        except NotTraceable as error:
-            warn_not_compiled(f"a step of {type(self).__name__}", error)
-            return
-        special.compile(library)
-        for old, new in (self._states, self._states[::-1]):
-            call: Any = special.bound([given, *self._inputs[1:], *old], [*new, *self.outputs])
-            self._sequences.append(CallSequence([*before, call]))  # type: ignore[list-item]
-        self._runs = [one.call(self._width) for one in self._sequences]
+        self._states = [[self._memory(one) for one in first] for _ in range(2)]
+        self.outputs: list[Array] = [*map(self._memory, outputs), last.T.copy()]
+        self._calls: list[Callable[[int, int], None]] = [
+            lambda _first, _last, now=now: self._run_step(now) for now in range(2)
+        ]
+        if traced is not None and AVAILABLE:
+            try:
+                special = Specialised(*traced, (self._inputs, state), True, 0, True)
+                special.compile(library)
+                for now, (old, new) in enumerate((self._states, self._states[::-1])):
+                    read, written = [given, *self._inputs[1:], *old], [*new, *self.outputs]
+                    self._calls[now] = special.bound(read, written)
+            except NotTraceable as error:
+                warn_not_compiled(f"a step of {type(self).__name__}", error)
+        if leader is not self:
+            leader.followers.add(self)
+        leader._join_calls()
 
     def _memory(self, like: Array) -> Array:
         memory = empty_lanes(like.shape[:-1], self._width)
-        memory[...] = 0.0
+        memory[...] = like
         return memory
 
-    def _run_step(self) -> None:
+    def _join_calls(self) -> None:
+        self._sequences: list[CallSequence] = []
+        self._runs: list[Callable[[], Any]] = []
+        for now in range(2):
+            calls: Any = [*self._before, self._calls[now], *(one._calls[now] for one in self.followers)]
+            if all(isinstance(call, Call) for call in calls):
+                self._sequences.append(CallSequence(calls))
+                self._runs.append(self._sequences[-1].call(self._width))
+            else:
+                self._runs.append(lambda calls=calls: [call(0, self._width) for call in calls])
+        self._left = 0
+
+    def _run_step(self, now: int) -> None:
         """Run a step with NumPy."""
-        for call in self._before:
-            call(0, self._width)
         with numpy.errstate(all="ignore"):
             state, (*outputs, last) = self._step(self._inputs, self.state)
-        memories = *self._states[1 - self._now], *self.outputs
+        memories = *self._states[1 - now], *self.outputs
         for memory, array in zip(memories, (*leaves(state), *outputs, last.T), strict=True):
             memory[...] = array
 
     @property
     def state(self) -> Any:
         """Copy of the state."""
-        return copy_arrays(self._template, self._states[self._now], self._kinds)
+        return copy_arrays(self._template, self._states[self._leader._now], self._kinds)
 
     def run(self, begins: Array | None = None, steps: Array | None = None) -> None:
         """Run a step of all lanes, or begin episodes of some, go on with some, and leave others as they are.
@@ -143,4 +159,4 @@ class Recursion:
             own[...] = array
 
     def _arrays(self) -> list[Array]:
-        return [*self._states[self._now], *self._inputs, *self.outputs]
+        return [*self._states[self._leader._now], *self._inputs, *self.outputs]

@@ -43,12 +43,11 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             finals = zip(infos["final_obs"], ended, observations, strict=True)
             values, available = self._read(numpy.stack([last if was else now for last, was, now in finals]))
-            infos, before = (
-                {**infos, "final_obs": rows_of(ended, values)},
-                (None, None, self._readings.complete.copy()),
-            )
+            infos = {**infos, "final_obs": rows_of(ended, values)}
+            for one in self._readings.followers:
+                one.final = one.shown.copy()
             values, begun = self._read(observations, ended, ~self._every)
-            self.events, available = [before, *self.events], numpy.where(ended[:, None], begun, available)
+            available = numpy.where(ended[:, None], begun, available)
         elif begins.any():
             is_begun = begins & (self._mode is AutoresetMode.NEXT_STEP)
             values, available = self._read(observations, is_begun, ~begins)
@@ -74,12 +73,12 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin episodes, and the filters of these lanes."""
         _, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        return self._take()[-1], infos
+        return self._estimates.shown.astype(self._dtype), infos
 
     def step(self, actions: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
         """Step the environments, and take their readings in."""
         _, rewards, terminations, truncations, infos = self.env.step(self._act(actions))
-        *finals, last = self._take()
-        if finals:
-            infos = {**infos, "final_obs": rows_of(infos["_final_obs"], finals[0])}
-        return last, rewards, terminations, truncations, infos
+        if "final_obs" in infos:
+            finals = self._estimates.final.astype(self._dtype)
+            infos = {**infos, "final_obs": rows_of(infos["_final_obs"], finals)}
+        return self._estimates.shown.astype(self._dtype), rewards, terminations, truncations, infos
