@@ -122,6 +122,8 @@ class Estimates(Recursion):
 
     Attributes:
         action_space: of the control; None without.
+        place: where actions of the environment are written before a step.
+        steering: where those of the control are.
         shown: what is shown, ``(fields,)`` of one lane, ``(N, fields)`` of several.
         final: the same before episodes began in the same step.
 
@@ -150,7 +152,7 @@ class Estimates(Recursion):
         self._kind = actions.dtype if p else None
         taken = numpy.zeros((width, *(actions.shape or ()) * (p > 0)))
         steered = numpy.zeros((*(own.action_space.shape or ()), width))
-        self._places = taken[self.own], steered.T[self.own]
+        self.place, self.steering = taken[self.own], steered.T[self.own]
         zeros = numpy.zeros((n + m, width))
         estimate = Estimate(zeros[:n], zeros[:n], zeros[0], zeros[:m])
         inputs = numpy.zeros((self._behind, p, width)) if p and self._behind else None
@@ -175,12 +177,6 @@ class Estimates(Recursion):
     def estimate(self) -> Estimate:
         """Copy of the last estimates."""
         return Estimate(*(one[..., : self.lanes].T for one in self.state.estimate))
-
-    def act(self, action: Any, own: Any) -> None:
-        """Set the actions of all lanes in the next step, of the environment and of the control; None without."""
-        self._places[0][...] = action
-        if own is not None:
-            self._places[1][...] = own
 
     def _step_of(self, model: Any, given: Any, state: FilterState) -> tuple[FilterState, tuple[Array]]:
         actions, begins, steps, complete, own = given

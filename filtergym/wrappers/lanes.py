@@ -40,12 +40,13 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     def _read(
         self, observations: Any, begins: Any = None, steps: Any = None, seeds: Any = None
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the readings of a step, see :meth:`.Recursion.run`, and whether they are received."""
+        """Return the readings of a step, see :meth:`.Readings.begin`, and whether they are received."""
         readings = self._readings
         readings.place[...] = observations
-        if begins is not None:
-            readings.name_episodes(begins, steps, seeds)
-        readings.run(begins, steps)
+        if begins is None:
+            readings.run()
+        else:
+            readings.begin(begins, steps, seeds)
         return readings.values.astype(self._dtype), readings.available.astype(bool)
 
 
@@ -82,14 +83,14 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
 
     def _act(self, action: Any) -> Any:
         """Set the actions of a step, and return the environment's; that of the filter is behind it on the last axis."""
-        own, estimates = None, self._estimates
+        estimates = self._estimates
         if estimates.action_space is not None:
+            own = action
             if self._joins:
-                joined, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
-                action, own = joined[..., :count], joined[..., count:]
-            else:
-                action, own = action
-        estimates.act(action, own)
+                own, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
+                own = own[..., :count], own[..., count:]
+            action, estimates.steering[...] = own
+        estimates.place[...] = action
         return action
 
 

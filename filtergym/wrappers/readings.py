@@ -217,14 +217,18 @@ class Readings(Recursion):
         observation, traced = numpy.zeros((width, fields)), (self._step_of, Graph())
         self.bind(self._step_of, traced, state, observation, [self._numbers], [draw], library)
         self.complete, available, values = self.outputs
-        self.place, self.values, self.available = observation[self.own], values[self.own], available.T[self.own]
+        self.place, self.values, self.available = (
+            observation[self.own],
+            values[self.own],
+            available.T[self.own],
+        )
 
-    def name_episodes(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None) -> None:
-        """Set whose noise the next step has.
+    def begin(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None = None) -> None:
+        """Begin episodes of some lanes, see :meth:`.Recursion.begin`.
 
         Args:
-            begins: whose episodes begin, booleans ``(N,)``.
-            steps: which go on, booleans ``(N,)``.
+            begins: whose episodes begin.
+            steps: which go on.
             seeds: of the episodes of all lanes; None, of all or of one: it goes on with its next episode, at first of a
                 random seed.
         """
@@ -237,6 +241,7 @@ class Readings(Recursion):
                 self._identities[:, lane], self._is_seeded[lane] = [drawn ^ STREAM << 32, 0], True
         own, self._ahead = self._times[: len(begins)], []
         own[:] = numpy.where(begins, -1, own - ~(begins | steps))  # the call adds one
+        super().begin(begins, steps)
 
     def _draw(self, first: int, last: int) -> None:
         """Make the numbers of a step without a compiler."""
@@ -249,9 +254,7 @@ class Readings(Recursion):
     def _arrays(self) -> list[Array]:
         return [*super()._arrays(), self._identities, self._times, self._is_seeded]
 
-    def _step_of(
-        self, given: tuple[Array, ...], state: SensorState
-    ) -> tuple[SensorState, tuple[Array, ...]]:
+    def _step_of(self, given: tuple[Array, ...], state: SensorState) -> tuple[SensorState, tuple[Array, ...]]:
         x, begins, steps, normals = given
         xp, m = namespace(x), len(self._delays)
         begins, uniforms = begins > 0.0, normals[self._counts[0] :]

@@ -77,7 +77,10 @@ class Recursion:
         leader, first = self._leader, leaves(state)
         places = iter(range(len(first)))
         self._step, self._before = step, before
-        self._template, self._kinds = map_arrays(lambda _: next(places), state), [one.dtype.kind for one in first]
+        self._template, self._kinds = (
+            map_arrays(lambda _: next(places), state),
+            [one.dtype.kind for one in first],
+        )
         self._inputs = (numpy.moveaxis(given, 0, -1), leader._begins, leader._steps, *inputs)
         with numpy.errstate(all="ignore"):
             *outputs, last = step(self._inputs, state)[1]
@@ -129,16 +132,8 @@ class Recursion:
         """Copy of the state."""
         return copy_arrays(self._template, self._states[self._leader._now], self._kinds)
 
-    def run(self, begins: Array | None = None, steps: Array | None = None) -> None:
-        """Run a step of all lanes, or begin episodes of some, go on with some, and leave others as they are.
-
-        Args:
-            begins: whose episodes begin, booleans ``(N,)``.
-            steps: which go on, booleans ``(N,)``.
-        """
-        if begins is not None:
-            self._begins[: self.lanes], self._steps[: self.lanes] = begins, steps
-            self._begins[self.lanes :] = begins.any()
+    def run(self) -> None:
+        """Run a step of all lanes."""
         if self._left == 0:
             self._left = UNCOUNTED // self._width + 1
             for sequence in self._sequences:
@@ -146,8 +141,18 @@ class Recursion:
         self._left -= 1
         self._runs[self._now]()
         self._now = 1 - self._now
-        if begins is not None:
-            self._begins[:], self._steps[:] = 0.0, 1.0
+
+    def begin(self, begins: Array, steps: Array) -> None:
+        """Run a step in which episodes of some lanes begin, some go on, and others stay as they are.
+
+        Args:
+            begins: whose episodes begin, booleans ``(N,)``.
+            steps: which go on, booleans ``(N,)``.
+        """
+        self._begins[: self.lanes], self._steps[: self.lanes] = begins, steps
+        self._begins[self.lanes :] = begins.any()
+        self.run()
+        self._begins[:], self._steps[:] = 0.0, 1.0
 
     def __getstate__(self) -> dict[str, Any]:
         """Return arguments and arrays; code is made anew."""
