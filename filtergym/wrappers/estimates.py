@@ -99,7 +99,7 @@ class FilterState(NamedTuple):
     """Steps of the episode, ``(W,)``."""
     filter: Any
     """State of the filters."""
-    inputs: Array | None
+    past: Array | None
     """Inputs of the last steps, the newest first, ``(longest delay, p, W)``; None without inputs or delays."""
     estimate: Estimate
     """Of the present, ``(..., W)``."""
@@ -145,33 +145,29 @@ class Estimates(Recursion):
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
         problem = define_problem(model, readings.sensors)
-        self._filter = own = _make_filter(problem, competitor, control, readings.lanes)
+        own = _make_filter(define_problem(model, readings.sensors), competitor, control, readings.lanes)
         self.action_space: Any = None if control is None else own.action_space
         self._behind = max(one.delay for one in readings.sensors.values())
         n, m, p, width = len(model.names), len(readings.complete) // 2, len(model.inputs), self._width
-        self._kind = actions.dtype if p else None
-        taken = numpy.zeros((width, *(actions.shape or ()) * (p > 0)))
+        self._kind = actions.dtype
+        taken = numpy.zeros((width, *(actions.shape or ())))
         steered = numpy.zeros((*(own.action_space.shape or ()), width))
         self.place, self.steering = taken[self.own], steered.T[self.own]
-        zeros = numpy.zeros((n + m, width))
-        estimate = Estimate(zeros[:n], zeros[:n], zeros[0], zeros[:m])
-        inputs = numpy.zeros((self._behind, p, width)) if p and self._behind else None
+        mean, covariance = numpy.array(model.mean, dtype=float), model.matrix("covariance")
+        self._initial = Initial(*(numpy.repeat(one[..., None], width, axis=-1) for one in (mean, covariance)))
+        self._deviation = numpy.sqrt(numpy.diag(covariance))[:, None]
         self._first: Any = map_arrays(lambda one: one[..., :1], own.start_filter(self._initial))
         """State of a filter at the start of an episode."""
-        begun = map_arrays(lambda one: numpy.repeat(one, width, axis=-1), self._first)
-        state = FilterState(zeros[0], begun, inputs, estimate)
+        zeros = numpy.zeros((n + m, 1))
+        estimate = Estimate(zeros[:n], zeros[:n], zeros[0], zeros[:m])
+        past = numpy.zeros((self._behind, p, 1)) if p and self._behind else None
         traced, step = None, functools.partial(self._step_of, own)
         if isinstance(own, CompiledModel) and not own.filter.in_python:
             traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
+        state = FilterState(zeros[0], self._first, past, estimate)
         self.bind(step, traced, state, taken, [readings.complete, steered])
         self.shown: Array = self.outputs[0][self.own]
         self.final: Array = self.shown
-
-    @property
-    def _initial(self) -> Initial:
-        mean = numpy.array(self._model.mean, dtype=float)[:, None]
-        parts = mean, self._model.matrix("covariance")[:, :, None]
-        return Initial(*(numpy.repeat(one, self._width, axis=-1) for one in parts))
 
     @property
     def estimate(self) -> Estimate:
@@ -179,54 +175,42 @@ class Estimates(Recursion):
         return Estimate(*(one[..., : self.lanes].T for one in self.state.estimate))
 
     def _step_of(self, model: Any, given: Any, state: FilterState) -> tuple[FilterState, tuple[Array]]:
-        actions, begins, steps, complete, own = given
-        xp, own_model, equations = model.task.xp, self._model, model.task.filter_equations[0]
-        begins, n, m = begins > 0.0, len(own_model.names), complete.shape[0] // 2
-        if model.filter.in_python and begins.any():
+        actions, phases, complete, steering = given
+        xp, own, equations, filter = model.task.xp, self._model, model.task.filter_equations[0], model.filter
+        n, m = len(own.names), complete.shape[0] // 2
+        begins, values, available, inputs, past = phases > 0.0, complete[:m], complete[m:], None, None
+        if filter.in_python and begins.any():
             model.start_filter(self._initial)  # it keeps its memory itself
-        is_active, values, available = begins | (steps > 0.0), complete[:m], complete[m:]
         step = xp.where(begins, 0.0, state.step + 1.0)
-        is_moving = is_active & (step > float(self._behind))
-        interval, inputs, past = xp.where(is_moving, own_model.interval, 0.0), None, None
-        if own_model.inputs:
+        is_moving = (phases == 0.0) & (step > float(self._behind))
+        if own.inputs:
             now = xp.moveaxis(xp.astype(actions, self._kind), -1, 0)
-            now = xp.asarray(now if own_model.action is None else own_model.action(now))
-            now = xp.astype(xp.reshape(now, (-1, len(own_model.inputs))), xp.float64).T
-            past = xp.where(begins, 0.0, now)[None]
-            if state.inputs is not None:
-                past = xp.concat([past, xp.where(begins, 0.0, state.inputs)])
+            now = xp.asarray(now if own.action is None else own.action(now))
+            past = xp.astype(xp.reshape(now, (-1, len(own.inputs))), xp.float64).T[None]
+            past = past if state.past is None else xp.concat([past, state.past])
+            past = xp.where(begins, 0.0, past)
             inputs = past[-1]
-        measurement = StateSpaceMeasurement(values, available, interval, inputs)
+        measurement = StateSpaceMeasurement(values, available, xp.where(is_moving, own.interval, 0.0), inputs)
         before = select_nested(begins, self._first, state.filter)
-        predicted = equations.measure(equations.move(model.filter.mean(before), measurement), measurement)
+        predicted = equations.measure(equations.move(filter.mean(before), measurement), measurement)
         innovation = xp.where(available > 0.0, equations.subtract(values, predicted), 0.0)
-        action = xp.where(is_moving, own, 0.0)
-        after = model.filter.predict(before, measurement)
-        after = model.filter.update(after, FilterInput(measurement, None, action))
-        mean, covariance = model.filter.mean(after), model.filter.covariance(after)
-        nis = model.filter.records(after, measurement).get("nis", 0.0 * mean[0])
+        action = xp.where(is_moving, steering, 0.0)
+        after = filter.update(filter.predict(before, measurement), FilterInput(measurement, None, action))
+        mean, covariance = filter.mean(after), filter.covariance(after)
+        nis = filter.records(after, measurement).get("nis", 0.0 * mean[0])
         nis = xp.where(xp.any(available > 0.0, axis=0), nis, 0.0)
         variances = xp.stack([covariance[i, i] for i in range(n)])
         is_kept = xp.all((xp.abs(mean) < LARGEST) & (variances < LARGEST), axis=0)
         for back in range(self._behind - 1, -1, -1):
-            going = xp.where(step > float(back), own_model.interval, 0.0)
+            going = xp.where(step > float(back), own.interval, 0.0)
             mean = equations.move(mean, Passage(going, None if past is None else past[back]))
-        mean = shorten(mean, model.task.periods)
-        first = Estimate(
-            model.filter.mean(self._first),
-            xp.sqrt(xp.stack([model.filter.covariance(self._first)[i, i] for i in range(n)])),
-            0.0 * nis,
-            innovation,
-        )
-        estimate = select_nested(is_kept, Estimate(mean, xp.sqrt(variances), nis, innovation), first)
+        mean = xp.where(is_kept, shorten(mean, model.task.periods), self._initial.mean[:, :1])
+        deviation = xp.where(is_kept, xp.sqrt(variances), self._deviation)
+        estimate = Estimate(mean, deviation, xp.where(is_kept, nis, 0.0), innovation)
         after = select_nested(is_kept, after, self._first)
-        found = FilterState(step, after, None if state.inputs is None else past[:-1], estimate)
-        found = select_nested(is_active, found, state)
-        parts = []
-        for name in self._show:
-            if name == "observation":
-                parts.append(xp.asarray(own_model.observation(found.estimate.mean.T)).T)
-            else:
-                one = getattr(found.estimate, name)
-                parts.append(one[None] if name == "nis" else one)
-        return found, (xp.concat(parts),)
+        found = FilterState(step, after, None if state.past is None else past[:-1], estimate)
+        found = select_nested(phases >= 0.0, found, state)
+        parts = {**found.estimate._asdict(), "nis": found.estimate.nis[None]}
+        if "observation" in self._show:
+            parts["observation"] = xp.asarray(own.observation(found.estimate.mean.T)).T
+        return found, (xp.concat([parts[name] for name in self._show]),)

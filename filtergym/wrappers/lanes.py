@@ -90,7 +90,8 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
                 own, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
                 own = own[..., :count], own[..., count:]
             action, estimates.steering[...] = own
-        estimates.place[...] = action
+        if self.model.inputs:
+            estimates.place[...] = action
         return action
 
 

@@ -176,46 +176,44 @@ class Readings(Recursion):
         lanes: int,
     ) -> None:
         super().__init__((sensors, model, fields, lanes), lanes)
-        self.sensors, self._model = sensors, model
-        size = fields if model is None else len(model.names)
-        self._interval: float = 1.0 if model is None else model.interval
+        self.sensors, self._model, width = sensors, model, self._width
+        size, self._interval = (fields, 1.0) if model is None else (len(model.names), model.interval)
         self._functions = [
             trace_measurement(f"h of the sensor {key!r}", sensors[key].h, size, 0) for key in sensors
         ]
         counts = [function.size for function in self._functions]
         self._channels: tuple[Channel, ...] = find_channels(sensors, counts, self._interval)
-        self._roots = [
-            _noise_root(name, one.R, count, size)
-            for (name, one), count in zip(sensors.items(), counts, strict=True)
-        ]
-        each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
+        self._roots = [_noise_root(one.name, sensors[one.name].R, one.size, size) for one in self._channels]
+        each = [sensors[one.name] for one in self._channels for _ in one.numbers]
         self._bias, self._quantum = (
             numpy.array([[getattr(one, name)] for one in each]) for name in ("bias", "quantum")
         )
         self._delays = [one.delay for one in each]
         self._periods = {i: PERIODS[one.wraps] for i, one in enumerate(each) if one.wraps}
-        self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
-        m, width, is_biased = len(each), self._width, bool(self._bias.any())
-        self.limit: Array = numpy.array(
-            [numpy.nextafter(0.5 * self._periods.get(i, numpy.inf), numpy.inf) for i in range(m)]
+        is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
+        m, is_biased = len(each), bool(self._bias.any())
+        halves = numpy.array([0.5 * self._periods.get(i, numpy.inf) for i in range(m)])
+        self.limit: Array = numpy.nextafter(halves, numpy.inf)
+        self._is_seeded, self._times = (
+            numpy.zeros(lanes, dtype=bool),
+            numpy.full(width, -1, dtype=numpy.int64),
         )
-        self._is_seeded = numpy.zeros(lanes, dtype=bool)
         self._identities = numpy.zeros((2, width), dtype=numpy.uint64)
-        self._times = numpy.full(width, -1, dtype=numpy.int64)
-        """Identities of the episodes and steps of their numbers, see :mod:`.counter_numbers`."""
-        self._counts = m * (1 + is_biased), len(sensors) * (not self._is_steady)
+        """Names of the episodes of the noise, see :mod:`.counter_numbers`; times are its measurements."""
+        self._counts = m * (1 + is_biased), len(sensors) * (not is_steady)
         """Of normal and of uniform numbers."""
-        self._numbers = numpy.zeros((sum(self._counts), width))
+        self._numbers, observation = numpy.zeros((sum(self._counts), width)), numpy.zeros((width, fields))
         self._ahead: list[Array] = []
         """Numbers of coming steps, the last ones first."""
-        zeros, late = numpy.zeros((m, width)), numpy.zeros((max(self._delays), 2, m, width))
+        zeros, late = numpy.zeros((m, 1)), numpy.zeros((max(self._delays), 2, m, 1))
         state = SensorState(zeros[0], zeros, zeros if is_biased else None, late if len(late) else None)
         draw, library = self._draw, None
         if AVAILABLE:
             draw = bind_numbers(self._identities, self._times, self._numbers, self._counts[0])
             library = portable_library()
-        observation, traced = numpy.zeros((width, fields)), (self._step_of, Graph())
-        self.bind(self._step_of, traced, state, observation, [self._numbers], [draw], library)
+        self.bind(
+            self._step_of, (self._step_of, Graph()), state, observation, [self._numbers], [draw], library
+        )
         self.complete, available, values = self.outputs
         self.place, self.values, self.available = (
             observation[self.own],
@@ -255,30 +253,25 @@ class Readings(Recursion):
         return [*super()._arrays(), self._identities, self._times, self._is_seeded]
 
     def _step_of(self, given: tuple[Array, ...], state: SensorState) -> tuple[SensorState, tuple[Array, ...]]:
-        x, begins, steps, normals = given
-        xp, m = namespace(x), len(self._delays)
-        begins, uniforms = begins > 0.0, normals[self._counts[0] :]
-        is_active = begins | (steps > 0.0)
+        x, phases, normals = given
+        xp, m, begins, is_active, rows = namespace(x), len(self._delays), phases > 0.0, phases >= 0.0, []
         if self._model is not None:
             x = xp.asarray(self._model.state(x.T)).T
-        values = xp.concat([h.value(x, xp) for h in self._functions])
-        rows: list[Array] = []
         for channel, root in zip(self._channels, self._roots, strict=True):
             L, own = root(x, xp) if callable(root) else root, normals[channel.places]
             rows += [sum(L[i][k] * own[k] for k in range(i + 1)) for i in range(channel.size)]
-        values, bias = values + xp.stack(rows), None
+        values, bias = xp.concat([h.value(x, xp) for h in self._functions]) + xp.stack(rows), None
         if state.bias is not None:
             bias = xp.where(begins, self._bias * normals[m : 2 * m], state.bias)
             values = values + bias
-        if self._quantum.any():
-            quanta = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
-            values = xp.where(self._quantum > 0.0, xp.round(values / quanta) * quanta, values)
+        quanta = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
+        values = xp.where(self._quantum > 0.0, xp.round(values / quanta) * quanta, values)
         values = shorten(values, self._periods)
         step, rows = xp.where(begins, 0.0, state.step + 1.0), []
         for place, channel in enumerate(self._channels):
             due = begins | is_active
-            if not self._is_steady:
-                due = uniforms[place] < channel.availability
+            if self._counts[1]:
+                due = normals[self._counts[0] + place] < channel.availability
             if channel.interval is not None:
                 share = self._interval / channel.interval
                 due = due & (xp.floor(step * share + EARLY) > xp.floor((step - 1.0) * share + EARLY))
@@ -290,11 +283,8 @@ class Readings(Recursion):
         sent, received = (xp.stack([now[d, i, j] for j, d in enumerate(self._delays)]) for i in range(2))
         last = xp.where(begins, values, xp.where(received > 0.0, sent, state.last))
         after = select_nested(is_active, SensorState(step, last, bias, waiting), state)
-        complete, received = (
-            xp.concat([now[-1, 0], xp.where(is_active, now[-1, 1], 0.0)]),
-            xp.where(is_active, received, 0.0),
-        )
-        return after, (complete, received, after.last)
+        made, received = (xp.where(is_active, one, 0.0) for one in (now[-1, 1], received))
+        return after, (xp.concat([now[-1, 0], made]), received, after.last)
 
 
 def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:

@@ -29,27 +29,27 @@ Array = numpy.ndarray
 class Recursion:
     """A recursion of N lanes (parallel episodes) in arrays ``(..., W)``, W the next multiple of eight.
 
-    A step computes state and outputs from the state before and inputs. There are two memories of the state, used
-    alternately. Where the step function can be traced, a step and those of all followers are one native call.
+    A step computes state and outputs from inputs and the state before; two memories of the state alternate. Where its
+    function can be traced, a step and those of all followers are one native call.
 
     Args:
         arguments: of the class's constructor, with which a copy is made.
         lanes: N.
-        leader: recursion behind which this one runs at every step, of as many lanes; None: it runs by itself.
+        leader: recursion of as many lanes, behind which this one runs at every step; None: it runs by itself.
 
     Attributes:
         lanes: N.
         own: index of the lanes among W; a single one has no axis.
+        followers: recursions that run behind this one.
         outputs: arrays that the step function returned last; of the last one the transpose, ``(W, rows)``.
     """
 
     def __init__(self, arguments: Sequence[Any], lanes: int, leader: "Recursion | None" = None) -> None:
         self._arguments, self.lanes, self._width = arguments, lanes, round_up_lanes(lanes)
-        self._leader: Recursion = leader or self
         self.own: Any = 0 if lanes == 1 else slice(lanes), ...
-        if leader is None:
-            self._begins, self._steps = numpy.zeros(self._width), numpy.ones(self._width)
-            self._now, self._left, self.followers = 0, 0, weakref.WeakSet[Recursion]()
+        self._leader: Recursion = leader or self
+        self._phases: Array = numpy.zeros(self._width) if leader is None else leader._phases
+        self._now, self._left, self.followers = 0, 0, weakref.WeakSet[Recursion]()
 
     def bind(
         self,
@@ -64,38 +64,36 @@ class Recursion:
         """Bind a step function to arrays.
 
         Args:
-            step: function of ``(given, begins, steps, *inputs)`` and the state, arrays of any namespace, that returns
-                the next state and a tuple of arrays. ``begins`` and ``steps`` are 1 where an episode begins and where
-                it goes on, else 0.
+            step: function of ``(given, phases, *inputs)`` and the state, arrays of any namespace, that returns the next
+                state and a tuple of arrays. A phase is 1 where an episode begins, 0 where it goes on, and -1 where
+                state and outputs stay.
             traced: the same function and its graph for the compiler; None: it runs with NumPy.
-            state: first state, nested tuples.
+            state: first state, nested tuples of arrays ``(..., 1)``.
             given: array that is written before a step, ``(W, ...)``; the step function takes it with W last.
             inputs: further arrays.
             before: calls of a range of lanes that precede every step.
             library: of the compiled functions; default: the fastest.
         """
-        leader, first = self._leader, leaves(state)
+        first, leader = leaves(state), self._leader
         places = iter(range(len(first)))
         self._step, self._before = step, before
         self._template, self._kinds = (
             map_arrays(lambda _: next(places), state),
             [one.dtype.kind for one in first],
         )
-        self._inputs = (numpy.moveaxis(given, 0, -1), leader._begins, leader._steps, *inputs)
-        with numpy.errstate(all="ignore"):
-            *outputs, last = step(self._inputs, state)[1]
+        self._inputs = (numpy.moveaxis(given, 0, -1), self._phases, *inputs)
         self._states = [[self._memory(one) for one in first] for _ in range(2)]
+        with numpy.errstate(all="ignore"):
+            *outputs, last = step(self._inputs, self.state)[1]
         self.outputs: list[Array] = [*map(self._memory, outputs), last.T.copy()]
-        self._calls: list[Callable[[int, int], None]] = [
-            lambda _first, _last, now=now: self._run_step(now) for now in range(2)
-        ]
+        self._calls: list[Any] = [lambda *_, now=now: self._run_step(now) for now in range(2)]
         if traced is not None and AVAILABLE:
             try:
                 special = Specialised(*traced, (self._inputs, state), True, 0, True)
                 special.compile(library)
+                read, written = [given, *self._inputs[1:]], self.outputs
                 for now, (old, new) in enumerate((self._states, self._states[::-1])):
-                    read, written = [given, *self._inputs[1:], *old], [*new, *self.outputs]
-                    self._calls[now] = special.bound(read, written)
+                    self._calls[now] = special.bound([*read, *old], [*new, *written])
             except NotTraceable as error:
                 warn_not_compiled(f"a step of {type(self).__name__}", error)
         if leader is not self:
@@ -108,15 +106,13 @@ class Recursion:
         return memory
 
     def _join_calls(self) -> None:
-        self._sequences: list[CallSequence] = []
-        self._runs: list[Callable[[], Any]] = []
-        for now in range(2):
-            calls: Any = [*self._before, self._calls[now], *(one._calls[now] for one in self.followers)]
-            if all(isinstance(call, Call) for call in calls):
-                self._sequences.append(CallSequence(calls))
-                self._runs.append(self._sequences[-1].call(self._width))
-            else:
-                self._runs.append(lambda calls=calls: [call(0, self._width) for call in calls])
+        calls = [[*self._before, *(one._calls[now] for one in (self, *self.followers))] for now in range(2)]
+        if all(isinstance(call, Call) for call in calls[0]):
+            self._sequences = [CallSequence(each) for each in calls]
+            self._runs: list[Callable[[], Any]] = [one.call(self._width) for one in self._sequences]
+        else:
+            self._sequences = []
+            self._runs = [lambda each=each: [call(0, self._width) for call in each] for each in calls]
         self._left = 0
 
     def _run_step(self, now: int) -> None:
@@ -143,16 +139,11 @@ class Recursion:
         self._now = 1 - self._now
 
     def begin(self, begins: Array, steps: Array) -> None:
-        """Run a step in which episodes of some lanes begin, some go on, and others stay as they are.
-
-        Args:
-            begins: whose episodes begin, booleans ``(N,)``.
-            steps: which go on, booleans ``(N,)``.
-        """
-        self._begins[: self.lanes], self._steps[: self.lanes] = begins, steps
-        self._begins[self.lanes :] = begins.any()
+        """Run a step in which episodes of some lanes begin and others go on, both booleans ``(N,)``."""
+        self._phases[:] = begins.any()
+        self._phases[: self.lanes] = numpy.where(begins, 1.0, steps - 1.0)
         self.run()
-        self._begins[:], self._steps[:] = 0.0, 1.0
+        self._phases[:] = 0.0
 
     def __getstate__(self) -> dict[str, Any]:
         """Return arguments and arrays; code is made anew."""
