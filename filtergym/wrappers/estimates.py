@@ -144,7 +144,6 @@ class Estimates(Recursion):
         self._model, self._show = model, show
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
-        problem = define_problem(model, readings.sensors)
         own = _make_filter(define_problem(model, readings.sensors), competitor, control, readings.lanes)
         self.action_space: Any = None if control is None else own.action_space
         self._behind = max(one.delay for one in readings.sensors.values())
@@ -184,9 +183,7 @@ class Estimates(Recursion):
         step = xp.where(begins, 0.0, state.step + 1.0)
         is_moving = (phases == 0.0) & (step > float(self._behind))
         if own.inputs:
-            now = xp.moveaxis(xp.astype(actions, self._kind), -1, 0)
-            now = xp.asarray(now if own.action is None else own.action(now))
-            past = xp.astype(xp.reshape(now, (-1, len(own.inputs))), xp.float64).T[None]
+            past = own.inputs_of(xp.moveaxis(xp.astype(actions, self._kind), -1, 0), xp).T[None]
             past = past if state.past is None else xp.concat([past, state.past])
             past = xp.where(begins, 0.0, past)
             inputs = past[-1]

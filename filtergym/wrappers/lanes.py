@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium
 import numpy
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv, VectorWrapper
 
 from .estimates import PARTS, Estimate, Estimates
 from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
@@ -112,12 +112,6 @@ def _set_space(wrapper: Any, kind: str, space: gymnasium.Space[Any]) -> None:
     setattr(wrapper, f"{kind}_space", space)
 
 
-def autoreset_of(env: Any) -> AutoresetMode:
-    """Return the autoreset mode of a vector environment, by default that of the next step."""
-    mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
-    return mode if isinstance(mode, AutoresetMode) else AutoresetMode(mode)
-
-
 def rows_of(lanes: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
     """Return the rows of some lanes as objects, and None for the others, as Gymnasium stores final observations."""
     rows = numpy.empty(len(lanes), dtype=object)
@@ -153,12 +147,12 @@ def check_state(model: EnvironmentModel, fields: int) -> tuple[str, ...]:
 def find_sensors(env: Any) -> SensorLanes:
     """Return the wrapper with sensors below a filter, or raise ValueError where there is none."""
     inner, module = env, " of filtergym.wrappers.vector" if isinstance(env, VectorEnv) else ""
-    while not isinstance(inner, SensorLanes):
+    while inner is not None and not isinstance(inner, SensorLanes):
         inner = getattr(inner, "env", None)
-        if inner is None:
-            raise ValueError(
-                f"EstimatedObservation needs sensors: wrap the environment in NoisyObservation{module} first"
-            )
+    if inner is None:
+        raise ValueError(
+            f"EstimatedObservation needs sensors: wrap the environment in NoisyObservation{module} first"
+        )
     return inner
 
 
@@ -169,34 +163,31 @@ def check_model(model: EnvironmentModel | None, readings: Any, space: Any) -> En
             f"no model is known of {getattr(readings.spec, 'id', 'this environment')}: give EstimatedObservation a "
             "model=EnvironmentModel(...), or one of filtergym.wrappers.fit_model"
         )
-    names, known = tuple(model.names), readings.model
-    if known is None and len(names) != readings.fields:
+    names, known, fields = tuple(model.names), readings.model, readings.fields
+    if len(names) != fields if known is None else names != tuple(known.names):
+        read = f"an observation of {fields} fields" if known is None else ", ".join(known.names)
         raise ValueError(
-            f"the model has {len(names)} components and the sensors read an observation of {readings.fields}: give "
-            "NoisyObservation the same model"
+            f"the model has the components {', '.join(names)}, and the sensors read {read}: give both wrappers one "
+            "model"
         )
-    if known is not None and names != tuple(known.names):
-        raise ValueError(
-            f"the model has the components {', '.join(names)}, and the sensors those of a model of "
-            f"{', '.join(known.names)}: give both wrappers one model"
-        )
+    if not model.inputs:
+        return model
     is_box, inputs = isinstance(space, gymnasium.spaces.Box), ", ".join(model.inputs)
-    if inputs and model.action is None and not is_box:
+    if model.action is None and not is_box:
         raise ValueError(
             f"the action space is {space}, and the model takes {inputs}: give the model action=, a function from "
             "actions to these inputs"
         )
     is_bounded = model in CLASSIC_CONTROL.values() and is_box and space.is_bounded()
-    if is_bounded and (inputs_of(model, numpy.full((1, *space.shape), 1e9)) != space.high).any():
+    if is_bounded and (model.inputs_of(numpy.full((1, *space.shape), 1e9)) != space.high).any():
         raise ValueError(
             f"the action space is {space}, and the model takes actions of the environment itself: let "
             "EstimatedObservation stand below wrappers that change the action, or give a model with action="
         )
-    example: Any = gymnasium.vector.utils.create_empty_array(space, 1, fn=numpy.zeros)
-    found = inputs_of(model, example)
-    if found.shape != (1, len(model.inputs)):
+    found = numpy.shape(model.inputs_of(numpy.zeros((1, *space.shape), space.dtype)))
+    if found != (1, len(model.inputs)):
         raise ValueError(
-            f"action of the model must return the {len(model.inputs)} inputs {inputs}, got the shape {found.shape[1:]}"
+            f"action of the model must return the {len(model.inputs)} inputs {inputs}, got the shape {found[1:]}"
         )
     return model
 
@@ -211,23 +202,10 @@ def check_shown(show: Any, model: EnvironmentModel) -> tuple[str, ...]:
     return show
 
 
-def inputs_of(model: EnvironmentModel, action: numpy.ndarray) -> numpy.ndarray:
-    """Return the inputs ``(N, p)`` of actions ``(N, ...)``."""
-    if not model.inputs:
-        return numpy.zeros((len(action), 0))
-    found = action if model.action is None else model.action(action)
-    return numpy.asarray(found, dtype=float).reshape(len(action), -1)
-
-
 def joint_space(env: gymnasium.Space[Any], own: gymnasium.Space[Any] | None) -> gymnasium.Space[Any]:
-    """Return the space of actions of the environment and of the filter: one box of both where they are boxes."""
+    """Return the space of actions of the environment and of the filter: one box where the environment's is a vector."""
     if own is None:
         return env
-    if (
-        isinstance(env, gymnasium.spaces.Box)
-        and isinstance(own, gymnasium.spaces.Box)
-        and len(env.shape) == 1
-    ):
-        low, high = (numpy.concatenate([getattr(one, end) for one in (env, own)]) for end in ("low", "high"))
-        return gymnasium.spaces.Box(low.astype(env.dtype), high.astype(env.dtype), dtype=env.dtype.type)
-    return gymnasium.spaces.Tuple((env, own))
+    both = gymnasium.spaces.Tuple((env, own))
+    is_vector = isinstance(env, gymnasium.spaces.Box) and len(env.shape) == 1
+    return gymnasium.spaces.flatten_space(both) if is_vector else both

@@ -66,6 +66,11 @@ class EnvironmentModel:
         given = numpy.asarray(getattr(self, name), dtype=float)
         return numpy.diag(given) if given.ndim == 1 else given
 
+    def inputs_of(self, actions: Any, xp: Any = numpy) -> Any:
+        """Return the inputs ``(N, p)`` of actions ``(N, ...)``, arrays of a namespace."""
+        found = xp.asarray(actions if self.action is None else self.action(actions))
+        return xp.reshape(xp.astype(found, xp.float64), (actions.shape[0], -1))
+
 
 def _cart_pole(x: Any, dt: Any, u: Any) -> list[Any]:
     sin, cos = numpy.sin(x[2]), numpy.cos(x[2])

@@ -20,6 +20,7 @@ from ..compiler.library import portable_library
 from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
 from ..compiler.vector_functions import VectorFunction
+from ..envs.contract.parameters import ParameterLimits, check
 from ..envs.linear.sensors import EARLY, Channel, Sensor
 from ..filters.angles import PERIODS, shorten
 from ..filters.array_namespace import namespace, select_nested
@@ -51,12 +52,8 @@ class EnvironmentSensor(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("bias", "quantum"):
-            value = getattr(self, name)
-            if not isinstance(value, int | float) or not 0.0 <= value < numpy.inf:
-                raise ValueError(f"{name} of a sensor must be a finite number of at least 0, got {value!r}")
-        if isinstance(self.delay, bool) or not isinstance(self.delay, int) or not 0 <= self.delay <= 100:
-            raise ValueError(f"delay of a sensor must be a number of steps from 0 to 100, got {self.delay!r}")
+        for name, hint, most in (("bias", float, None), ("delay", int, 100), ("quantum", float, None)):
+            check(f"{name} of a sensor", getattr(self, name), hint, ParameterLimits(at_least=0, at_most=most))
 
 
 def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) -> dict[str, EnvironmentSensor]:
@@ -99,8 +96,9 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
     """Return the places of components that are named, numbered or chosen by a matrix; None for any other h."""
     if not callable(h) and numpy.shape(h)[1:] == (len(names),):
-        chosen = _chosen_columns(numpy.asarray(h, dtype=float))
-        return chosen.tolist() if chosen is not None and len(chosen) else None
+        rows = numpy.asarray(h, dtype=float)
+        is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
+        return rows.argmax(axis=1).tolist() if is_choice and len(rows) else None
     kinds = (str, int, numpy.integer)
     listed: Any = [h] if isinstance(h, kinds) else h
     if not isinstance(listed, Sequence) or not all(isinstance(one, kinds) for one in listed):
@@ -114,12 +112,6 @@ def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | 
             )
         places.append(names.index(one) if isinstance(one, str) else int(one))
     return places
-
-
-def _chosen_columns(rows: Array) -> Array | None:
-    """Return the column that each row of a matrix chooses; None where a row is not one 1 among zeros."""
-    is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
-    return rows.argmax(axis=1) if is_choice else None
 
 
 def _noise_matrix(R: Any, count: int) -> Array:

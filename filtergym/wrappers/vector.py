@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from .lanes import FilterLanes, SensorLanes, autoreset_of, rows_of
+from .lanes import FilterLanes, SensorLanes, rows_of
 
 __all__ = ["EstimatedObservation", "NoisyObservation"]
 
@@ -19,7 +19,7 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], sensors: Any, model: Any = None) -> None:
         super().__init__(env, sensors, model)
-        self._mode: AutoresetMode = autoreset_of(env)
+        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._every = numpy.ones(env.num_envs, dtype=bool)
         self._ended = ~self._every
         """Lanes whose episode ended in the last step, and that have not begun anew."""
