@@ -79,15 +79,3 @@ class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     Raises:
         ValueError: where no sensors are below, or the model does not fit.
     """
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin an episode, and the filter with its first readings."""
-        _, info = self.env.reset(seed=seed, options=options)
-        return self._estimates.shown.astype(self._dtype), info
-
-    def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and take its readings in."""
-        _, reward, terminated, truncated, info = self.env.step(self._act(action))
-        return self._estimates.shown.astype(self._dtype), reward, terminated, truncated, info

@@ -81,18 +81,26 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
         """The last estimates of all lanes, not rounded to the type of the observation."""
         return self._estimates.estimate
 
-    def _act(self, action: Any) -> Any:
-        """Set the actions of a step, and return the environment's; that of the filter is behind it on the last axis."""
-        estimates = self._estimates
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[numpy.ndarray, dict[str, Any]]:
+        """Begin episodes, and their filters with the first readings."""
+        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[attr-defined]
+        return self._estimates.shown.astype(self._dtype), info
+
+    def step(self, action: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
+        """Step, and take the readings in; an action of the filter is behind that of the environment."""
+        estimates, applied = self._estimates, action
         if estimates.action_space is not None:
-            own = action
             if self._joins:
-                own, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
-                own = own[..., :count], own[..., count:]
-            action, estimates.steering[...] = own
+                both, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
+                action = both[..., :count], both[..., count:]
+            applied, estimates.steering[...] = action
         if self.model.inputs:
-            estimates.place[...] = action
-        return action
+            estimates.place[...] = applied
+        _, reward, terminated, truncated, info = self.env.step(applied)  # type: ignore[attr-defined]
+        if "_final_obs" in info:
+            finals = estimates.final.astype(self._dtype)
+            info = {**info, "final_obs": rows_of(info["_final_obs"], finals)}
+        return estimates.shown.astype(self._dtype), reward, terminated, truncated, info
 
 
 def _wrap(wrapper: Any, env: Any) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any], int]:

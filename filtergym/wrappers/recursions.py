@@ -6,16 +6,8 @@ from typing import Any
 
 import numpy
 
-from ..compiler.functions import (
-    UNCOUNTED,
-    Call,
-    Specialised,
-    copy_arrays,
-    empty_lanes,
-    leaves,
-    map_arrays,
-    round_up_lanes,
-)
+from ..compiler import functions
+from ..compiler.functions import UNCOUNTED, Call, Specialised, leaves
 from ..compiler.library import Library
 from ..compiler.namespace import NotTraceable
 from ..compiler.native import AVAILABLE
@@ -45,7 +37,7 @@ class Recursion:
     """
 
     def __init__(self, arguments: Sequence[Any], lanes: int, leader: "Recursion | None" = None) -> None:
-        self._arguments, self.lanes, self._width = arguments, lanes, round_up_lanes(lanes)
+        self._arguments, self.lanes, self._width = arguments, lanes, functions.round_up_lanes(lanes)
         self.own: Any = 0 if lanes == 1 else slice(lanes), ...
         self._leader: Recursion = leader or self
         self._phases: Array = numpy.zeros(self._width) if leader is None else leader._phases
@@ -75,12 +67,9 @@ class Recursion:
             library: of the compiled functions; default: the fastest.
         """
         first, leader = leaves(state), self._leader
-        places = iter(range(len(first)))
+        places, self._kinds = iter(range(len(first))), [one.dtype.kind for one in first]
+        self._template = functions.map_arrays(lambda _: next(places), state)
         self._step, self._before = step, before
-        self._template, self._kinds = (
-            map_arrays(lambda _: next(places), state),
-            [one.dtype.kind for one in first],
-        )
         self._inputs = (numpy.moveaxis(given, 0, -1), self._phases, *inputs)
         self._states = [[self._memory(one) for one in first] for _ in range(2)]
         with numpy.errstate(all="ignore"):
@@ -101,12 +90,13 @@ class Recursion:
         leader._join_calls()
 
     def _memory(self, like: Array) -> Array:
-        memory = empty_lanes(like.shape[:-1], self._width)
+        memory = functions.empty_lanes(like.shape[:-1], self._width)
         memory[...] = like
         return memory
 
     def _join_calls(self) -> None:
-        calls = [[*self._before, *(one._calls[now] for one in (self, *self.followers))] for now in range(2)]
+        chain = [self, *self.followers]
+        calls = [[*self._before, *(one._calls[now] for one in chain)] for now in range(2)]
         if all(isinstance(call, Call) for call in calls[0]):
             self._sequences = [CallSequence(each) for each in calls]
             self._runs: list[Callable[[], Any]] = [one.call(self._width) for one in self._sequences]
@@ -126,7 +116,7 @@ class Recursion:
     @property
     def state(self) -> Any:
         """Copy of the state."""
-        return copy_arrays(self._template, self._states[self._leader._now], self._kinds)
+        return functions.copy_arrays(self._template, self._states[self._leader._now], self._kinds)
 
     def run(self) -> None:
         """Run a step of all lanes."""

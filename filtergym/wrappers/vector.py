@@ -67,18 +67,3 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     A lane has the estimates, bit for bit, that a single environment of its seed has. With autoreset in the same step
     ``infos["final_obs"]`` holds the last estimate of an episode.
     """
-
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin episodes, and the filters of these lanes."""
-        _, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        return self._estimates.shown.astype(self._dtype), infos
-
-    def step(self, actions: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
-        """Step the environments, and take their readings in."""
-        _, rewards, terminations, truncations, infos = self.env.step(self._act(actions))
-        if "final_obs" in infos:
-            finals = self._estimates.final.astype(self._dtype)
-            infos = {**infos, "final_obs": rows_of(infos["_final_obs"], finals)}
-        return self._estimates.shown.astype(self._dtype), rewards, terminations, truncations, infos
