@@ -46,7 +46,8 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
     """
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
     kept = {name: {field: getattr(one, field) for field in fields} for name, one in sensors.items()}
-    key = id(model), *((name, *map(_key, values.values())) for name, values in kept.items())
+    plain = lambda value: id(value) if callable(value) else numpy.asarray(value).tolist()  # noqa: E731
+    key = id(model), repr([(name, [*map(plain, one.values())]) for name, one in kept.items()])
     if key not in _PROBLEMS:
         Q = model.matrix("noise")
         task = state_space(
@@ -57,12 +58,6 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
         )  # fmt: skip
         _PROBLEMS[key] = Problem(task, state_space_baselines(task)), (model, sensors)
     return _PROBLEMS[key][0]
-
-
-def _key(value: Any) -> Any:
-    """Return numbers and words as text, and a function by its identity."""
-    plain = value.tolist() if isinstance(value, numpy.ndarray) else value
-    return id(value) if callable(value) else repr(plain)
 
 
 def _make_filter(problem: Problem, competitor: Any, control: str | None, lanes: int) -> Any:
@@ -90,19 +85,6 @@ class Estimate(NamedTuple):
     """Normalised innovation squared of the last readings, ``(N,)``; zero where none was received."""
     innovation: Array
     """Readings minus those predicted at the last estimate, ``(N, m)``; zero where none was received."""
-
-
-class FilterState(NamedTuple):
-    """What filters keep from step to step."""
-
-    step: Array
-    """Steps of the episode, ``(W,)``."""
-    filter: Any
-    """State of the filters."""
-    past: Array | None
-    """Inputs of the last steps, the newest first, ``(longest delay, p, W)``; None without inputs or delays."""
-    estimate: Estimate
-    """Of the present, ``(..., W)``."""
 
 
 class Estimates(Recursion):
@@ -163,7 +145,7 @@ class Estimates(Recursion):
         traced, step = None, functools.partial(self._step_of, own)
         if isinstance(own, CompiledModel) and not own.filter.in_python:
             traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
-        state = FilterState(zeros[0], self._first, past, estimate)
+        state = zeros[0], self._first, past, estimate
         self.bind(step, traced, state, taken, [readings.complete, steered])
         self.shown: Array = self.outputs[0][self.own]
         self.final: Array = self.shown
@@ -171,24 +153,29 @@ class Estimates(Recursion):
     @property
     def estimate(self) -> Estimate:
         """Copy of the last estimates."""
-        return Estimate(*(one[..., : self.lanes].T for one in self.state.estimate))
+        return Estimate(*(one[..., : self.lanes].T for one in self.state[-1]))
 
-    def _step_of(self, model: Any, given: Any, state: FilterState) -> tuple[FilterState, tuple[Array]]:
-        actions, phases, complete, steering = given
+    def _step_of(self, model: Any, given: Any, state: Any) -> tuple[Any, tuple[Array]]:
+        """Return the next state, and what is shown.
+
+        The state is the step of the episode, that of the filters, inputs of the last steps ``(delay, p, W)``, the
+        newest first, and the :class:`Estimate` of the present, ``(..., W)``.
+        """
+        (actions, phases, complete, steering), (step, before, waiting, _) = given, state
         xp, own, equations, filter = model.task.xp, self._model, model.task.filter_equations[0], model.filter
-        n, m = len(own.names), complete.shape[0] // 2
-        begins, values, available, inputs, past = phases > 0.0, complete[:m], complete[m:], None, None
+        n, m, begins, inputs, past = len(own.names), complete.shape[0] // 2, phases > 0.0, None, None
+        values, available = complete[:m], complete[m:]
         if filter.in_python and begins.any():
             model.start_filter(self._initial)  # it keeps its memory itself
-        step = xp.where(begins, 0.0, state.step + 1.0)
+        step = xp.where(begins, 0.0, step + 1.0)
         is_moving = (phases == 0.0) & (step > float(self._behind))
         if own.inputs:
             past = own.inputs_of(xp.moveaxis(xp.astype(actions, self._kind), -1, 0), xp).T[None]
-            past = past if state.past is None else xp.concat([past, state.past])
+            past = past if waiting is None else xp.concat([past, waiting])
             past = xp.where(begins, 0.0, past)
             inputs = past[-1]
         measurement = StateSpaceMeasurement(values, available, xp.where(is_moving, own.interval, 0.0), inputs)
-        before = select_nested(begins, self._first, state.filter)
+        before = select_nested(begins, self._first, before)
         predicted = equations.measure(equations.move(filter.mean(before), measurement), measurement)
         innovation = xp.where(available > 0.0, equations.subtract(values, predicted), 0.0)
         action = xp.where(is_moving, steering, 0.0)
@@ -205,9 +192,9 @@ class Estimates(Recursion):
         deviation = xp.where(is_kept, xp.sqrt(variances), self._deviation)
         estimate = Estimate(mean, deviation, xp.where(is_kept, nis, 0.0), innovation)
         after = select_nested(is_kept, after, self._first)
-        found = FilterState(step, after, None if state.past is None else past[:-1], estimate)
+        found = step, after, None if waiting is None else past[:-1], estimate
         found = select_nested(phases >= 0.0, found, state)
-        parts = {**found.estimate._asdict(), "nis": found.estimate.nis[None]}
+        parts = {**found[-1]._asdict(), "nis": found[-1].nis[None]}
         if "observation" in self._show:
-            parts["observation"] = xp.asarray(own.observation(found.estimate.mean.T)).T
+            parts["observation"] = xp.asarray(own.observation(parts["mean"].T)).T
         return found, (xp.concat([parts[name] for name in self._show]),)

@@ -20,10 +20,10 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
         space, _, lanes = _wrap(self, env)
         self.fields: int = check_observations(space, env.spec)
         self.model: EnvironmentModel | None = find_model(model, env.spec)
-        if self.model is None:
-            names, angles = tuple(map(str, range(self.fields))), {}
-        else:
-            names, angles = check_state(self.model, self.fields), self.model.angles
+        names = (
+            [*map(str, range(self.fields))] if self.model is None else check_state(self.model, self.fields)
+        )
+        angles = {} if self.model is None else self.model.angles
         self.sensors: dict[str, EnvironmentSensor] = read_sensors(sensors, names, angles)
         self._readings: Readings = Readings(self.sensors, self.model, self.fields, lanes)
         is_real = numpy.issubdtype(space.dtype, numpy.floating)
@@ -139,9 +139,9 @@ def check_observations(space: gymnasium.Space[Any], spec: Any) -> int:
     )
 
 
-def check_state(model: EnvironmentModel, fields: int) -> tuple[str, ...]:
+def check_state(model: EnvironmentModel, fields: int) -> list[str]:
     """Return the names of a model's components, or raise ValueError where it makes no state of the observation."""
-    names = tuple(model.names)
+    names = [*model.names]
     with contextlib.suppress(IndexError):
         if model.state(numpy.zeros((1, fields))).shape == (1, len(names)):
             return names

@@ -160,22 +160,19 @@ def find_model(model: Any, spec: Any) -> EnvironmentModel | None:
     """
     if isinstance(model, EnvironmentModel):
         return model
-    name = model if model is not None else getattr(spec, "id", None)
-    if name is None:
-        return None
-    if isinstance(name, str):
-        module, colon, attribute = name.partition(":")
-        if colon and model is not None:
-            found = getattr(importlib.import_module(module), attribute, None)
-            if isinstance(found, EnvironmentModel):
-                return found
-        found = CLASSIC_CONTROL.get(name.rpartition("/")[2].rpartition("-v")[0] or name)
-        if found is not None and model is None and spec.kwargs.get("g", 10.0) != 10.0:
+    name = str(getattr(spec, "id", "") if model is None else model)
+    found: Any = CLASSIC_CONTROL.get(name.rpartition("/")[2].rpartition("-v")[0] or name)
+    if model is None:
+        if found is not None and spec.kwargs.get("g", 10.0) != 10.0:
             raise ValueError(
                 f"the model of {name} is that of g = 10, and this one has g = {spec.kwargs['g']}: give model="
             )
-        if found is not None or model is None:
-            return found
+        return found
+    module, colon, attribute = name.partition(":")
+    if colon:
+        found = getattr(importlib.import_module(module), attribute, None)
+    if isinstance(found, EnvironmentModel):
+        return found
     raise ValueError(
         f"model must be an EnvironmentModel, 'module:attribute' of one, or one of {', '.join(CLASSIC_CONTROL)}, got "
         f"{model!r}"

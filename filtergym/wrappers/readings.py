@@ -129,27 +129,8 @@ class Reading(NamedTuple):
     """Whether a reading is received, ``(N, m)`` of booleans."""
 
 
-class SensorState(NamedTuple):
-    """What sensors keep from step to step."""
-
-    step: Array
-    """Steps of the episode, ``(W,)``."""
-    last: Array
-    """Last readings that were received, ``(m, W)``."""
-    bias: Array | None
-    """Constant errors, ``(m, W)``; None: no sensor has one."""
-    waiting: Array | None
-    """Earlier readings and 1 where they were made, the newest first, ``(longest delay, 2, m, W)``; None without."""
-
-
 class Readings(Recursion):
-    """Sensors of N lanes (parallel episodes).
-
-    Args:
-        sensors: of :func:`read_sensors`.
-        model: whose state they read; None: the observation.
-        fields: of an observation.
-        lanes: N.
+    """Sensors of N lanes (parallel episodes) on the state of a model, or on the observation of fields where it is None.
 
     Attributes:
         limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
@@ -170,48 +151,42 @@ class Readings(Recursion):
         super().__init__((sensors, model, fields, lanes), lanes)
         self.sensors, self._model, width = sensors, model, self._width
         size, self._interval = (fields, 1.0) if model is None else (len(model.names), model.interval)
-        self._functions = [
-            trace_measurement(f"h of the sensor {key!r}", sensors[key].h, size, 0) for key in sensors
-        ]
+        traced = (
+            trace_measurement(f"h of the sensor {key!r}", one.h, size, 0) for key, one in sensors.items()
+        )
+        self._functions = tuple(traced)
         counts = [function.size for function in self._functions]
         self._channels: tuple[Channel, ...] = find_channels(sensors, counts, self._interval)
         self._roots = [_noise_root(one.name, sensors[one.name].R, one.size, size) for one in self._channels]
         each = [sensors[one.name] for one in self._channels for _ in one.numbers]
-        self._bias, self._quantum = (
-            numpy.array([[getattr(one, name)] for one in each]) for name in ("bias", "quantum")
-        )
+        self._bias, self._quantum = numpy.array([[one.bias, one.quantum] for one in each], dtype=float).T[
+            ..., None
+        ]
         self._delays = [one.delay for one in each]
         self._periods = {i: PERIODS[one.wraps] for i, one in enumerate(each) if one.wraps}
-        is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
-        m, is_biased = len(each), bool(self._bias.any())
+        m, is_biased, late = len(each), bool(self._bias.any()), max(self._delays)
         halves = numpy.array([0.5 * self._periods.get(i, numpy.inf) for i in range(m)])
         self.limit: Array = numpy.nextafter(halves, numpy.inf)
-        self._is_seeded, self._times = (
-            numpy.zeros(lanes, dtype=bool),
-            numpy.full(width, -1, dtype=numpy.int64),
-        )
-        self._identities = numpy.zeros((2, width), dtype=numpy.uint64)
-        """Names of the episodes of the noise, see :mod:`.counter_numbers`; times are its measurements."""
+        is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
         self._counts = m * (1 + is_biased), len(sensors) * (not is_steady)
-        """Of normal and of uniform numbers."""
+        """Of normal and of uniform numbers of a step."""
         self._numbers, observation = numpy.zeros((sum(self._counts), width)), numpy.zeros((width, fields))
         self._ahead: list[Array] = []
         """Numbers of coming steps, the last ones first."""
-        zeros, late = numpy.zeros((m, 1)), numpy.zeros((max(self._delays), 2, m, 1))
-        state = SensorState(zeros[0], zeros, zeros if is_biased else None, late if len(late) else None)
-        draw, library = self._draw, None
+        self._identities = numpy.zeros((2, width), dtype=numpy.uint64)
+        self._times = numpy.full(width, -1, dtype=numpy.int64)
+        """Identities of the episodes and steps of their numbers, see :mod:`.counter_numbers`."""
+        self._is_seeded = numpy.zeros(lanes, dtype=bool)
+        draw: Any = self._draw
         if AVAILABLE:
             draw = bind_numbers(self._identities, self._times, self._numbers, self._counts[0])
-            library = portable_library()
-        self.bind(
-            self._step_of, (self._step_of, Graph()), state, observation, [self._numbers], [draw], library
-        )
+        zeros = numpy.zeros((m, 1))
+        state = zeros[0], zeros, zeros if is_biased else None, numpy.zeros((late, 2, m, 1)) if late else None
+        step, library = self._step_of, portable_library() if AVAILABLE else None
+        self.bind(step, (step, Graph()), state, observation, [self._numbers], [draw], library)
         self.complete, available, values = self.outputs
-        self.place, self.values, self.available = (
-            observation[self.own],
-            values[self.own],
-            available.T[self.own],
-        )
+        self.place, self.values = observation[self.own], values[self.own]
+        self.available: Array = available.T[self.own]
 
     def begin(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None = None) -> None:
         """Begin episodes of some lanes, see :meth:`.Recursion.begin`.
@@ -244,22 +219,27 @@ class Readings(Recursion):
     def _arrays(self) -> list[Array]:
         return [*super()._arrays(), self._identities, self._times, self._is_seeded]
 
-    def _step_of(self, given: tuple[Array, ...], state: SensorState) -> tuple[SensorState, tuple[Array, ...]]:
-        x, phases, normals = given
-        xp, m, begins, is_active, rows = namespace(x), len(self._delays), phases > 0.0, phases >= 0.0, []
+    def _step_of(self, given: Any, state: Any) -> tuple[Any, tuple[Array, ...]]:
+        """Return the next state, and complete, available and last readings.
+
+        The state is the step of the episode, last readings, constant errors and those under way ``(delay, 2, m, W)``,
+        the newest first, with 1 where they were made.
+        """
+        (x, phases, normals), (step, last, bias, waiting), m = given, state, len(self._delays)
+        xp, begins, is_active, rows = namespace(x), phases > 0.0, phases >= 0.0, []
         if self._model is not None:
             x = xp.asarray(self._model.state(x.T)).T
         for channel, root in zip(self._channels, self._roots, strict=True):
             L, own = root(x, xp) if callable(root) else root, normals[channel.places]
             rows += [sum(L[i][k] * own[k] for k in range(i + 1)) for i in range(channel.size)]
-        values, bias = xp.concat([h.value(x, xp) for h in self._functions]) + xp.stack(rows), None
-        if state.bias is not None:
-            bias = xp.where(begins, self._bias * normals[m : 2 * m], state.bias)
+        values = xp.concat([h.value(x, xp) for h in self._functions]) + xp.stack(rows)
+        if bias is not None:
+            bias = xp.where(begins, self._bias * normals[m : 2 * m], bias)
             values = values + bias
         quanta = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
         values = xp.where(self._quantum > 0.0, xp.round(values / quanta) * quanta, values)
         values = shorten(values, self._periods)
-        step, rows = xp.where(begins, 0.0, state.step + 1.0), []
+        step, rows = xp.where(begins, 0.0, step + 1.0), []
         for place, channel in enumerate(self._channels):
             due = begins | is_active
             if self._counts[1]:
@@ -268,15 +248,15 @@ class Readings(Recursion):
                 share = self._interval / channel.interval
                 due = due & (xp.floor(step * share + EARLY) > xp.floor((step - 1.0) * share + EARLY))
             rows += [xp.where(begins | due, 1.0, 0.0)] * channel.size
-        now, waiting = xp.stack([values, xp.stack(rows)])[None], None
-        if state.waiting is not None:
-            now = xp.concat([now, xp.where(begins, 0.0, state.waiting)])
+        now = xp.stack([values, xp.stack(rows)])[None]
+        if waiting is not None:
+            now = xp.concat([now, xp.where(begins, 0.0, waiting)])
             waiting = now[:-1]
         sent, received = (xp.stack([now[d, i, j] for j, d in enumerate(self._delays)]) for i in range(2))
-        last = xp.where(begins, values, xp.where(received > 0.0, sent, state.last))
-        after = select_nested(is_active, SensorState(step, last, bias, waiting), state)
+        last = xp.where(begins, values, xp.where(received > 0.0, sent, last))
+        after = select_nested(is_active, (step, last, bias, waiting), state)
         made, received = (xp.where(is_active, one, 0.0) for one in (now[-1, 1], received))
-        return after, (xp.concat([now[-1, 0], made]), received, after.last)
+        return after, (xp.concat([now[-1, 0], made]), received, after[1])
 
 
 def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:
@@ -286,10 +266,9 @@ def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:
         ValueError: where R is no covariance.
     """
     if callable(given):
-        R = VectorFunction(
-            lambda x: [one for row in numpy.reshape(given(x), (count, count)) for one in row], size
-        )
-        return lambda x, xp: cholesky(xp.reshape(R.value(x, xp), (count, count, -1)))
+        entries = lambda x: [one for row in numpy.reshape(given(x), (count, count)) for one in row]  # noqa: E731
+        function = VectorFunction(entries, size)
+        return lambda x, xp: cholesky(xp.reshape(function.value(x, xp), (count, count, -1)))
     R = _noise_matrix(given, count)
     if R.shape == (count, count) and numpy.isfinite(R).all():
         with contextlib.suppress(numpy.linalg.LinAlgError):
