@@ -5,7 +5,6 @@ import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy
 
 from ..baselines.problem import Problem
@@ -93,15 +92,6 @@ class Estimates(Recursion):
     Sensors of several delays are taken in together when the last of them has come: the filter then runs as many steps
     behind, and the mean is carried to the present by the motion and the inputs since.
 
-    Args:
-        model: of the environment.
-        readings: of its state.
-        competitor: name of an estimator of a state-space model, such as ``"extended"``, or what makes one.
-        control: ``"noise"`` or ``"gain"``: an action multiplies these of the filter as written, in place of a
-            competitor; None: nothing does.
-        show: words of :data:`PARTS`.
-        actions: space of the environment's actions.
-
     Attributes:
         action_space: of the control; None without.
         place: where actions of the environment are written before a step.
@@ -118,9 +108,9 @@ class Estimates(Recursion):
         model: EnvironmentModel,
         readings: Readings,
         competitor: Any,
-        control: str | None,
-        show: tuple[str, ...],
-        actions: gymnasium.Space[Any],
+        control: Any,
+        show: Any,
+        actions: Any,
     ) -> None:
         super().__init__((model, readings, competitor, control, show, actions), readings.lanes, readings)
         self._model, self._show = model, show
@@ -146,7 +136,7 @@ class Estimates(Recursion):
         if isinstance(own, CompiledModel) and not own.filter.in_python:
             traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
         state = zeros[0], self._first, past, estimate
-        self.bind(step, traced, state, taken, [readings.complete, steered])
+        self.bind(step, traced, state, taken, readings.complete, steered)
         self.shown: Array = self.outputs[0][self.own]
         self.final: Array = self.shown
 

@@ -54,12 +54,7 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
     """Filters of the lanes of an environment."""
 
     def __init__(
-        self,
-        env: Any,
-        model: Any = None,
-        competitor: Any = "extended",
-        show: Any = None,
-        control: str | None = None,
+        self, env: Any, model: Any = None, competitor: Any = "extended", show: Any = None, control: Any = None
     ) -> None:
         given = {"model": model, "competitor": competitor, "show": show, "control": control}
         super().__init__(**given, _disable_deepcopy=True)

@@ -59,11 +59,6 @@ class EnvironmentSensor(Sensor):
 def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) -> dict[str, EnvironmentSensor]:
     """Return sensors with their h as a matrix or a function of the state.
 
-    Args:
-        given: sensors by their names: objects, or mappings of their fields.
-        names: of the components of the state, ``(n,)``.
-        angles: units of those that are angles, by their names.
-
     Raises:
         ValueError: for a sensor that is none, or of a component that does not exist.
     """
@@ -173,17 +168,16 @@ class Readings(Recursion):
         self._numbers, observation = numpy.zeros((sum(self._counts), width)), numpy.zeros((width, fields))
         self._ahead: list[Array] = []
         """Numbers of coming steps, the last ones first."""
-        self._identities = numpy.zeros((2, width), dtype=numpy.uint64)
-        self._times = numpy.full(width, -1, dtype=numpy.int64)
+        seeds = numpy.random.SeedSequence().generate_state(width, numpy.uint64)
+        self._identities, self._times = numpy.stack([seeds, 0 * seeds]), numpy.full(width, -1)
         """Identities of the episodes and steps of their numbers, see :mod:`.counter_numbers`."""
-        self._is_seeded = numpy.zeros(lanes, dtype=bool)
-        draw: Any = self._draw
+        self._before = [self._draw]
         if AVAILABLE:
-            draw = bind_numbers(self._identities, self._times, self._numbers, self._counts[0])
+            self.library = portable_library()  # rounds as NumPy
+            self._before = [bind_numbers(self._identities, self._times, self._numbers, self._counts[0])]
         zeros = numpy.zeros((m, 1))
         state = zeros[0], zeros, zeros if is_biased else None, numpy.zeros((late, 2, m, 1)) if late else None
-        step, library = self._step_of, portable_library() if AVAILABLE else None
-        self.bind(step, (step, Graph()), state, observation, [self._numbers], [draw], library)
+        self.bind(self._step_of, (self._step_of, Graph()), state, observation, self._numbers)
         self.complete, available, values = self.outputs
         self.place, self.values = observation[self.own], values[self.own]
         self.available: Array = available.T[self.own]
@@ -191,19 +185,14 @@ class Readings(Recursion):
     def begin(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None = None) -> None:
         """Begin episodes of some lanes, see :meth:`.Recursion.begin`.
 
-        Args:
-            begins: whose episodes begin.
-            steps: which go on.
-            seeds: of the episodes of all lanes; None, of all or of one: it goes on with its next episode, at first of a
-                random seed.
+        Without a seed, one of all or of one, a lane goes on with its next episode, at first of a random seed.
         """
         for lane in numpy.flatnonzero(begins).tolist():
             seed = None if seeds is None else seeds[lane]
-            if seed is None and self._is_seeded[lane]:
+            if seed is None:
                 self._identities[1, lane] += numpy.uint64(1)
             else:
-                drawn = int(numpy.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
-                self._identities[:, lane], self._is_seeded[lane] = [drawn ^ STREAM << 32, 0], True
+                self._identities[:, lane] = int(seed) ^ STREAM << 32, 0
         own, self._ahead = self._times[: len(begins)], []
         own[:] = numpy.where(begins, -1, own - ~(begins | steps))  # the call adds one
         super().begin(begins, steps)
@@ -217,7 +206,7 @@ class Readings(Recursion):
         self._numbers[...] = self._ahead.pop()
 
     def _arrays(self) -> list[Array]:
-        return [*super()._arrays(), self._identities, self._times, self._is_seeded]
+        return [*super()._arrays(), self._identities, self._times]
 
     def _step_of(self, given: Any, state: Any) -> tuple[Any, tuple[Array, ...]]:
         """Return the next state, and complete, available and last readings.

@@ -11,7 +11,6 @@ from ..compiler.functions import UNCOUNTED, Call, Specialised, leaves
 from ..compiler.library import Library
 from ..compiler.namespace import NotTraceable
 from ..compiler.native import AVAILABLE
-from ..compiler.program import Graph
 from ..compiler.sequence import CallSequence
 from ..envs.engine.compiled import warn_not_compiled
 
@@ -36,23 +35,19 @@ class Recursion:
         outputs: arrays that the step function returned last; of the last one the transpose, ``(W, rows)``.
     """
 
+    library: Library | None = None
+    """Of the compiled functions; None: the fastest."""
+
     def __init__(self, arguments: Sequence[Any], lanes: int, leader: "Recursion | None" = None) -> None:
         self._arguments, self.lanes, self._width = arguments, lanes, functions.round_up_lanes(lanes)
         self.own: Any = 0 if lanes == 1 else slice(lanes), ...
         self._leader: Recursion = leader or self
         self._phases: Array = numpy.zeros(self._width) if leader is None else leader._phases
-        self._now, self._left, self.followers = 0, 0, weakref.WeakSet[Recursion]()
+        self._now, self._left, self.followers = 0, 0, weakref.WeakSet[Any]()
+        self._before: list[Any] = []
+        """Calls of a range of lanes that precede every step."""
 
-    def bind(
-        self,
-        step: Callable[..., Any],
-        traced: tuple[Callable[..., Any], Graph] | None,
-        state: Any,
-        given: Array,
-        inputs: Sequence[Array] = (),
-        before: Sequence[Callable[[int, int], None]] = (),
-        library: Library | None = None,
-    ) -> None:
+    def bind(self, step: Callable[..., Any], traced: Any, state: Any, given: Array, *inputs: Array) -> None:
         """Bind a step function to arrays.
 
         Args:
@@ -62,14 +57,11 @@ class Recursion:
             traced: the same function and its graph for the compiler; None: it runs with NumPy.
             state: first state, nested tuples of arrays ``(..., 1)``.
             given: array that is written before a step, ``(W, ...)``; the step function takes it with W last.
-            inputs: further arrays.
-            before: calls of a range of lanes that precede every step.
-            library: of the compiled functions; default: the fastest.
+            *inputs: further arrays.
         """
         first, leader = leaves(state), self._leader
-        places, self._kinds = iter(range(len(first))), [one.dtype.kind for one in first]
+        self._step, places, self._kinds = step, iter(range(len(first))), [one.dtype.kind for one in first]
         self._template = functions.map_arrays(lambda _: next(places), state)
-        self._step, self._before = step, before
         self._inputs = (numpy.moveaxis(given, 0, -1), self._phases, *inputs)
         self._states = [[self._memory(one) for one in first] for _ in range(2)]
         with numpy.errstate(all="ignore"):
@@ -79,10 +71,10 @@ class Recursion:
         if traced is not None and AVAILABLE:
             try:
                 special = Specialised(*traced, (self._inputs, state), True, 0, True)
-                special.compile(library)
-                read, written = [given, *self._inputs[1:]], self.outputs
+                special.compile(self.library)
                 for now, (old, new) in enumerate((self._states, self._states[::-1])):
-                    self._calls[now] = special.bound([*read, *old], [*new, *written])
+                    arrays = [given, *self._inputs[1:], *old], [*new, *self.outputs]
+                    self._calls[now] = special.bound(*arrays)
             except NotTraceable as error:
                 warn_not_compiled(f"a step of {type(self).__name__}", error)
         if leader is not self:
