@@ -280,8 +280,13 @@ class CallSequence:
 
         The caller keeps the sequence, and calls :meth:`expect` before the first run and once in a while.
         """
-        lanes = ctypes.c_int64(0), ctypes.c_int64(width)
-        return functools.partial(_driver(), ctypes.c_void_p(address_of(self._given)), *lanes)
+        driver: Callable[..., None] = _driver()
+        address, first, last = (
+            ctypes.c_void_p(address_of(self._given)),
+            ctypes.c_int64(0),
+            ctypes.c_int64(width),
+        )
+        return functools.partial(driver, address, first, last)
 
     def count_with(self, other: "CallSequence") -> None:
         """Share the count of lanes with another sequence of the same code on other memory."""

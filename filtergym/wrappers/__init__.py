@@ -57,8 +57,11 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and read the sensors."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        values, info["available"] = self._read(observation)
-        return values, reward, terminated, truncated, info
+        readings = self._readings
+        readings.place[...] = observation
+        readings.run()
+        info["available"] = readings.available.astype(bool)
+        return readings.values.astype(self._dtype), reward, terminated, truncated, info
 
 
 class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -38,11 +38,7 @@ _PROBLEMS: dict[tuple[Any, ...], tuple[Problem, Any]] = {}
 
 
 def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSensor]) -> Problem:
-    """Return the estimation problem of a model and sensors, which is defined once.
-
-    Raises:
-        ValueError: for a model that :func:`filtergym.state_space` refuses.
-    """
+    """Return the estimation problem of a model and sensors, which :func:`filtergym.state_space` defines once."""
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
     kept = {name: {field: getattr(one, field) for field in fields} for name, one in sensors.items()}
     plain = lambda value: id(value) if callable(value) else numpy.asarray(value).tolist()  # noqa: E731
@@ -68,8 +64,8 @@ def _make_filter(problem: Problem, competitor: Any, control: str | None, lanes: 
         return own
     maker = problem.find(competitor) if isinstance(competitor, str) else competitor
     if maker is None or kind_of(maker) != "estimator":
-        known = ", ".join(problem.baselines.estimators)
-        raise ValueError(f"competitor must be an estimator, one of {known}, got {competitor!r}")
+        known = f"one of {', '.join(problem.baselines.estimators)}"
+        raise ValueError(f"competitor must be an estimator, {known}, got {competitor!r}")
     return close_loop(own, maker, "estimator", str(competitor), lanes)
 
 
@@ -94,13 +90,9 @@ class Estimates(Recursion):
 
     Attributes:
         action_space: of the control; None without.
-        place: where actions of the environment are written before a step.
-        steering: where those of the control are.
+        place, steering: where actions of the environment and of the control are written before a step.
         shown: what is shown, ``(fields,)`` of one lane, ``(N, fields)`` of several.
         final: the same before episodes began in the same step.
-
-    Raises:
-        ValueError: for an unknown competitor or control, or a model that cannot be one.
     """
 
     def __init__(
@@ -110,9 +102,9 @@ class Estimates(Recursion):
         competitor: Any,
         control: Any,
         show: Any,
-        actions: Any,
+        space: Any,
     ) -> None:
-        super().__init__((model, readings, competitor, control, show, actions), readings.lanes, readings)
+        super().__init__((model, readings, competitor, control, show, space), readings.lanes, readings)
         self._model, self._show = model, show
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
@@ -120,8 +112,8 @@ class Estimates(Recursion):
         self.action_space: Any = None if control is None else own.action_space
         self._behind = max(one.delay for one in readings.sensors.values())
         n, m, p, width = len(model.names), len(readings.complete) // 2, len(model.inputs), self._width
-        self._kind = actions.dtype
-        taken = numpy.zeros((width, *(actions.shape or ())))
+        self._kind = space.dtype
+        taken = numpy.zeros((width, *(space.shape or ())))
         steered = numpy.zeros((*(own.action_space.shape or ()), width))
         self.place, self.steering = taken[self.own], steered.T[self.own]
         mean, covariance = numpy.array(model.mean, dtype=float), model.matrix("covariance")
@@ -140,11 +132,6 @@ class Estimates(Recursion):
         self.shown: Array = self.outputs[0][self.own]
         self.final: Array = self.shown
 
-    @property
-    def estimate(self) -> Estimate:
-        """Copy of the last estimates."""
-        return Estimate(*(one[..., : self.lanes].T for one in self.state[-1]))
-
     def _step_of(self, model: Any, given: Any, state: Any) -> tuple[Any, tuple[Array]]:
         """Return the next state, and what is shown.
 
@@ -152,8 +139,10 @@ class Estimates(Recursion):
         newest first, and the :class:`Estimate` of the present, ``(..., W)``.
         """
         (actions, phases, complete, steering), (step, before, waiting, _) = given, state
-        xp, own, equations, filter = model.task.xp, self._model, model.task.filter_equations[0], model.filter
-        n, m, begins, inputs, past = len(own.names), complete.shape[0] // 2, phases > 0.0, None, None
+        xp, equations, filter = model.task.xp, model.task.filter_equations[0], model.filter
+        own: Any = self._model
+        n, m, begins = len(own.names), complete.shape[0] // 2, phases > 0.0
+        past: Any = None
         values, available = complete[:m], complete[m:]
         if filter.in_python and begins.any():
             model.start_filter(self._initial)  # it keeps its memory itself
@@ -163,8 +152,8 @@ class Estimates(Recursion):
             past = own.inputs_of(xp.moveaxis(xp.astype(actions, self._kind), -1, 0), xp).T[None]
             past = past if waiting is None else xp.concat([past, waiting])
             past = xp.where(begins, 0.0, past)
-            inputs = past[-1]
-        measurement = StateSpaceMeasurement(values, available, xp.where(is_moving, own.interval, 0.0), inputs)
+        interval = xp.where(is_moving, own.interval, 0.0)
+        measurement = StateSpaceMeasurement(values, available, interval, past if past is None else past[-1])
         before = select_nested(begins, self._first, before)
         predicted = equations.measure(equations.move(filter.mean(before), measurement), measurement)
         innovation = xp.where(available > 0.0, equations.subtract(values, predicted), 0.0)

@@ -36,9 +36,6 @@ def fit_model(
         angles: components that are angles, by their names; they turn without limit in the fit.
         seed: of the rollouts.
 
-    Returns:
-        The model.
-
     Raises:
         ValueError: for an observation or an action that is no vector, or too few steps.
     """
@@ -75,9 +72,8 @@ def fit_model(
     def f(x: Any, dt: Any, u: Any) -> list[Any]:
         found = terms([*(x[i] for i in range(n)), *(u[j] for j in range(p))])
         share = dt / interval
-        return [
-            x[i] + share * sum(float(weights[k, i]) * one for k, one in enumerate(found)) for i in range(n)
-        ]
+        change = [sum(float(weights[k, i]) * one for k, one in enumerate(found)) for i in range(n)]
+        return [x[i] + share * change[i] for i in range(n)]
 
     return EnvironmentModel(
         names=names, f=f, interval=interval, noise=noise, mean=starts.mean(axis=0),

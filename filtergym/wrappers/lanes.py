@@ -56,25 +56,27 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
     def __init__(
         self, env: Any, model: Any = None, competitor: Any = "extended", show: Any = None, control: Any = None
     ) -> None:
-        given = {"model": model, "competitor": competitor, "show": show, "control": control}
-        super().__init__(**given, _disable_deepcopy=True)
+        super().__init__(
+            model=model, competitor=competitor, show=show, control=control, _disable_deepcopy=True
+        )
         _, actions, _ = _wrap(self, env)
         self._sensors: SensorLanes = find_sensors(env)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model: EnvironmentModel = check_model(found, self._sensors, actions)
         kept = competitor, control, check_shown(show, self.model), actions
         self._estimates: Estimates = Estimates(self.model, self._sensors._readings, *kept)
-        joined = joint_space(actions, self._estimates.action_space)
-        self._joins, self._own_actions = isinstance(joined, gymnasium.spaces.Box), actions
         self._dtype: Any = self._sensors._dtype
         shape = self._estimates.shown.shape[-1:]
         _set_space(self, "observation", gymnasium.spaces.Box(-numpy.inf, numpy.inf, shape, self._dtype.type))
-        _set_space(self, "action", joined)
+        if self._estimates.action_space is not None:
+            both: gymnasium.Space[Any] = gymnasium.spaces.Tuple((actions, self._estimates.action_space))
+            is_vector = isinstance(actions, gymnasium.spaces.Box) and len(actions.shape) == 1
+            _set_space(self, "action", gymnasium.spaces.flatten_space(both) if is_vector else both)
 
     @property
     def estimates(self) -> Estimate:
         """The last estimates of all lanes, not rounded to the type of the observation."""
-        return self._estimates.estimate
+        return Estimate(*(one[..., : self._estimates.lanes].T for one in self._estimates.state[-1]))
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin episodes, and their filters with the first readings."""
@@ -85,9 +87,9 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
         """Step, and take the readings in; an action of the filter is behind that of the environment."""
         estimates, applied = self._estimates, action
         if estimates.action_space is not None:
-            if self._joins:
-                both, count = numpy.asarray(action), self._own_actions.shape[-1]  # type: ignore[index]
-                action = both[..., :count], both[..., count:]
+            if not isinstance(self.action_space, gymnasium.spaces.Tuple):  # type: ignore[attr-defined]
+                both, count = numpy.asarray(action), estimates.steering.shape[-1]
+                action = both[..., :-count], both[..., -count:]
             applied, estimates.steering[...] = action
         if self.model.inputs:
             estimates.place[...] = applied
@@ -124,10 +126,10 @@ def rows_of(lanes: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
 
 def check_observations(space: gymnasium.Space[Any], spec: Any) -> int:
     """Return the number of fields of observations, or raise ValueError where they are no vector of numbers."""
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
-        return int(space.shape[0])
-    kind = "an image" if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1 else repr(space)
-    name = getattr(spec, "id", "the environment")
+    axes = len(space.shape) if isinstance(space, gymnasium.spaces.Box) else 0
+    if axes == 1:
+        return int(space.shape[0])  # type: ignore[index]
+    kind, name = "an image" if axes > 1 else repr(space), getattr(spec, "id", "the environment")
     raise ValueError(
         f"sensors read a vector of numbers, and the observation of {name} is {kind}: wrap it in "
         "gymnasium.wrappers.FlattenObservation first, or give sensors to an environment whose observation is its state"
@@ -203,12 +205,3 @@ def check_shown(show: Any, model: EnvironmentModel) -> tuple[str, ...]:
     if not show or not {*show} <= {*known} or len({*show}) != len(show):
         raise ValueError(f"show must be different words of {', '.join(known)}, got {show!r}")
     return show
-
-
-def joint_space(env: gymnasium.Space[Any], own: gymnasium.Space[Any] | None) -> gymnasium.Space[Any]:
-    """Return the space of actions of the environment and of the filter: one box where the environment's is a vector."""
-    if own is None:
-        return env
-    both = gymnasium.spaces.Tuple((env, own))
-    is_vector = isinstance(env, gymnasium.spaces.Box) and len(env.shape) == 1
-    return gymnasium.spaces.flatten_space(both) if is_vector else both

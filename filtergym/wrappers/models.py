@@ -56,10 +56,8 @@ class EnvironmentModel:
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle a model of :data:`CLASSIC_CONTROL` by its name."""
-        for name, model in CLASSIC_CONTROL.items():
-            if model is self:
-                return find_model, (name, None)
-        return super().__reduce_ex__(protocol)
+        names = [name for name, model in CLASSIC_CONTROL.items() if model is self]
+        return (find_model, (names[0], None)) if names else super().__reduce_ex__(protocol)
 
     def matrix(self, name: str) -> Array:
         """Return ``noise`` or ``covariance`` as a matrix, ``(n, n)``."""
@@ -154,9 +152,6 @@ def find_model(model: Any, spec: Any) -> EnvironmentModel | None:
         model: an :class:`EnvironmentModel`; a name of :data:`CLASSIC_CONTROL`, with or without a version;
             ``"module:attribute"`` of one of yours, which is imported; or None.
         spec: of the environment, or None.
-
-    Raises:
-        ValueError: for any other name.
     """
     if isinstance(model, EnvironmentModel):
         return model

@@ -27,7 +27,6 @@ from ..filters.array_namespace import namespace, select_nested
 from ..filters.small_matrices import cholesky
 from ..own_equations import trace_measurement
 from ..own_sensors import find_channels
-from .models import EnvironmentModel
 from .recursions import Array, Recursion
 
 STREAM = zlib.crc32(b"filtergym.wrappers.NoisyObservation")
@@ -136,27 +135,19 @@ class Readings(Recursion):
             behind them 1 where they were made, ``(2 m, W)``.
     """
 
-    def __init__(
-        self,
-        sensors: Mapping[str, EnvironmentSensor],
-        model: EnvironmentModel | None,
-        fields: int,
-        lanes: int,
-    ) -> None:
+    def __init__(self, sensors: Mapping[str, EnvironmentSensor], model: Any, fields: int, lanes: int) -> None:
         super().__init__((sensors, model, fields, lanes), lanes)
         self.sensors, self._model, width = sensors, model, self._width
+        self._interval: float
         size, self._interval = (fields, 1.0) if model is None else (len(model.names), model.interval)
-        traced = (
-            trace_measurement(f"h of the sensor {key!r}", one.h, size, 0) for key, one in sensors.items()
-        )
-        self._functions = tuple(traced)
+        what = "h of the sensor {!r}".format
+        self._functions = [trace_measurement(what(name), one.h, size, 0) for name, one in sensors.items()]
         counts = [function.size for function in self._functions]
         self._channels: tuple[Channel, ...] = find_channels(sensors, counts, self._interval)
         self._roots = [_noise_root(one.name, sensors[one.name].R, one.size, size) for one in self._channels]
         each = [sensors[one.name] for one in self._channels for _ in one.numbers]
-        self._bias, self._quantum = numpy.array([[one.bias, one.quantum] for one in each], dtype=float).T[
-            ..., None
-        ]
+        faults = numpy.array([[one.bias, one.quantum] for one in each], dtype=float)
+        self._bias, self._quantum = faults.T[..., None]
         self._delays = [one.delay for one in each]
         self._periods = {i: PERIODS[one.wraps] for i, one in enumerate(each) if one.wraps}
         m, is_biased, late = len(each), bool(self._bias.any()), max(self._delays)
@@ -182,17 +173,16 @@ class Readings(Recursion):
         self.place, self.values = observation[self.own], values[self.own]
         self.available: Array = available.T[self.own]
 
-    def begin(self, begins: Array, steps: Array, seeds: Sequence[int | None] | None = None) -> None:
+    def begin(self, begins: Array, steps: Array, seeds: Any = None) -> None:
         """Begin episodes of some lanes, see :meth:`.Recursion.begin`.
 
         Without a seed, one of all or of one, a lane goes on with its next episode, at first of a random seed.
         """
         for lane in numpy.flatnonzero(begins).tolist():
-            seed = None if seeds is None else seeds[lane]
-            if seed is None:
+            if seeds is None or seeds[lane] is None:
                 self._identities[1, lane] += numpy.uint64(1)
             else:
-                self._identities[:, lane] = int(seed) ^ STREAM << 32, 0
+                self._identities[:, lane] = int(seeds[lane]) ^ STREAM << 32, 0
         own, self._ahead = self._times[: len(begins)], []
         own[:] = numpy.where(begins, -1, own - ~(begins | steps))  # the call adds one
         super().begin(begins, steps)
@@ -249,7 +239,7 @@ class Readings(Recursion):
 
 
 def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:
-    """Return the root of a sensor's R, or a function of states ``(n, W)`` and their namespace that returns its rows.
+    """Return the rows of the root of a sensor's R, or a function of states and their namespace that returns them.
 
     Raises:
         ValueError: where R is no covariance.

@@ -1,5 +1,6 @@
 """Recursions of parallel lanes in fixed arrays: one native call a step where their functions can be traced."""
 
+import functools
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -63,14 +64,16 @@ class Recursion:
         self._step, places, self._kinds = step, iter(range(len(first))), [one.dtype.kind for one in first]
         self._template = functions.map_arrays(lambda _: next(places), state)
         self._inputs = (numpy.moveaxis(given, 0, -1), self._phases, *inputs)
-        self._states = [[self._memory(one) for one in first] for _ in range(2)]
+        memories = [numpy.repeat(one.astype(float), self._width, axis=-1) for one in first]
+        self._states = memories, [one.copy() for one in memories]
         with numpy.errstate(all="ignore"):
             *outputs, last = step(self._inputs, self.state)[1]
-        self.outputs: list[Array] = [*map(self._memory, outputs), last.T.copy()]
-        self._calls: list[Any] = [lambda *_, now=now: self._run_step(now) for now in range(2)]
+        self.outputs: list[Array] = [numpy.array(one, order="C") for one in (*outputs, last.T)]
+        self._calls: list[Any] = [functools.partial(self._run_step, now) for now in range(2)]
         if traced is not None and AVAILABLE:
+            function, graph = traced
             try:
-                special = Specialised(*traced, (self._inputs, state), True, 0, True)
+                special = Specialised(function, graph, (self._inputs, state), True, 0, True)
                 special.compile(self.library)
                 for now, (old, new) in enumerate((self._states, self._states[::-1])):
                     arrays = [given, *self._inputs[1:], *old], [*new, *self.outputs]
@@ -81,23 +84,18 @@ class Recursion:
             leader.followers.add(self)
         leader._join_calls()
 
-    def _memory(self, like: Array) -> Array:
-        memory = functions.empty_lanes(like.shape[:-1], self._width)
-        memory[...] = like
-        return memory
-
     def _join_calls(self) -> None:
         chain = [self, *self.followers]
         calls = [[*self._before, *(one._calls[now] for one in chain)] for now in range(2)]
         if all(isinstance(call, Call) for call in calls[0]):
             self._sequences = [CallSequence(each) for each in calls]
-            self._runs: list[Callable[[], Any]] = [one.call(self._width) for one in self._sequences]
+            self._runs: list[Any] = [one.call(self._width) for one in self._sequences]
         else:
             self._sequences = []
             self._runs = [lambda each=each: [call(0, self._width) for call in each] for each in calls]
         self._left = 0
 
-    def _run_step(self, now: int) -> None:
+    def _run_step(self, now: int, *lanes: int) -> None:
         """Run a step with NumPy."""
         with numpy.errstate(all="ignore"):
             state, (*outputs, last) = self._step(self._inputs, self.state)
