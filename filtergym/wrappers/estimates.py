@@ -109,6 +109,10 @@ class Estimates(Recursion):
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
         own = _make_filter(define_problem(model, readings.sensors), competitor, control, readings.lanes)
+        if own.filter.in_python and self.lanes > 1:
+            raise ValueError(
+                f"{competitor!r} runs in Python, where lanes have one memory: wrap each environment"
+            )
         self.action_space: Any = None if control is None else own.action_space
         self._behind = max(one.delay for one in readings.sensors.values())
         n, m, p, width = len(model.names), len(readings.complete) // 2, len(model.inputs), self._width

@@ -20,10 +20,9 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
         space, _, lanes = _wrap(self, env)
         self.fields: int = check_observations(space, env.spec)
         self.model: EnvironmentModel | None = find_model(model, env.spec)
-        names = (
-            [*map(str, range(self.fields))] if self.model is None else check_state(self.model, self.fields)
-        )
-        angles = {} if self.model is None else self.model.angles
+        names, angles = [str(i) for i in range(self.fields)], dict[str, str]()
+        if self.model is not None:
+            names, angles = check_state(self.model, self.fields), dict(self.model.angles)
         self.sensors: dict[str, EnvironmentSensor] = read_sensors(sensors, names, angles)
         self._readings: Readings = Readings(self.sensors, self.model, self.fields, lanes)
         is_real = numpy.issubdtype(space.dtype, numpy.floating)
@@ -199,9 +198,8 @@ def check_model(model: EnvironmentModel | None, readings: Any, space: Any) -> En
 
 def check_shown(show: Any, model: EnvironmentModel) -> tuple[str, ...]:
     """Return what is shown of an estimate, by default the form of the environment's observation where there is one."""
-    default = ("mean",) if model.observation is None else ("observation",)
-    show = default if show is None else (show,) if isinstance(show, str) else tuple(show)
-    known = PARTS if model.observation is not None else PARTS[1:]
+    known = PARTS[model.observation is None :]
+    show = known[:1] if show is None else (show,) if isinstance(show, str) else tuple(show)
     if not show or not {*show} <= {*known} or len({*show}) != len(show):
         raise ValueError(f"show must be different words of {', '.join(known)}, got {show!r}")
     return show

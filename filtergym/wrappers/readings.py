@@ -56,11 +56,7 @@ class EnvironmentSensor(Sensor):
 
 
 def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) -> dict[str, EnvironmentSensor]:
-    """Return sensors with their h as a matrix or a function of the state.
-
-    Raises:
-        ValueError: for a sensor that is none, or of a component that does not exist.
-    """
+    """Return sensors with h as a matrix or a function of the state, or raise ValueError for one that cannot be."""
     if not isinstance(given, Mapping) or not given:
         raise ValueError(f"sensors must be a mapping from names to sensors, at least one, got {given!r}")
     fields = [one.name for one in dataclasses.fields(EnvironmentSensor)]
@@ -110,8 +106,7 @@ def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | 
 
 def _noise_matrix(R: Any, count: int) -> Array:
     """Return R as an array; a single number is the variance of each of the numbers that a sensor measures."""
-    given = numpy.asarray(R, dtype=float)
-    return numpy.diag(numpy.broadcast_to(given, count)) if given.ndim == 0 else given
+    return numpy.diag(numpy.full(count, float(R))) if numpy.ndim(R) == 0 else numpy.asarray(R, dtype=float)
 
 
 class Reading(NamedTuple):
@@ -138,8 +133,8 @@ class Readings(Recursion):
     def __init__(self, sensors: Mapping[str, EnvironmentSensor], model: Any, fields: int, lanes: int) -> None:
         super().__init__((sensors, model, fields, lanes), lanes)
         self.sensors, self._model, width = sensors, model, self._width
-        self._interval: float
-        size, self._interval = (fields, 1.0) if model is None else (len(model.names), model.interval)
+        self._interval: float = 1.0 if model is None else model.interval
+        size = fields if model is None else len(model.names)
         what = "h of the sensor {!r}".format
         self._functions = [trace_measurement(what(name), one.h, size, 0) for name, one in sensors.items()]
         counts = [function.size for function in self._functions]
@@ -239,11 +234,7 @@ class Readings(Recursion):
 
 
 def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:
-    """Return the rows of the root of a sensor's R, or a function of states and their namespace that returns them.
-
-    Raises:
-        ValueError: where R is no covariance.
-    """
+    """Return the Cholesky factor of R, or a function of states and namespace that does, or raise ValueError."""
     if callable(given):
         entries = lambda x: [one for row in numpy.reshape(given(x), (count, count)) for one in row]  # noqa: E731
         function = VectorFunction(entries, size)

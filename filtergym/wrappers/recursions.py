@@ -26,7 +26,6 @@ class Recursion:
 
     Args:
         arguments: of the class's constructor, with which a copy is made.
-        lanes: N.
         leader: recursion of as many lanes, behind which this one runs at every step; None: it runs by itself.
 
     Attributes:
