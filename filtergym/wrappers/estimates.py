@@ -83,7 +83,7 @@ class Estimate(NamedTuple):
 
 
 class Estimates(Recursion):
-    """The filters of N lanes (parallel episodes).
+    """Filters of N lanes (parallel episodes) behind their sensors.
 
     Sensors of several delays are taken in together when the last of them has come: the filter then runs as many steps
     behind, and the mean is carried to the present by the motion and the inputs since.
@@ -137,7 +137,7 @@ class Estimates(Recursion):
         self.final: Array = self.shown
 
     def _step_of(self, model: Any, given: Any, state: Any) -> tuple[Any, tuple[Array]]:
-        """Return the next state, and what is shown.
+        """Return the next state, and the parts of the estimate that are shown.
 
         The state is the step of the episode, that of the filters, inputs of the last steps ``(delay, p, W)``, the
         newest first, and the :class:`Estimate` of the present, ``(..., W)``.

@@ -13,7 +13,7 @@ from .readings import EnvironmentSensor, Reading, Readings, read_sensors
 
 
 class SensorLanes(gymnasium.utils.RecordConstructorArgs):
-    """Sensors of the lanes of an environment."""
+    """What both kinds of NoisyObservation share: sensors of one environment, or of each of many."""
 
     def __init__(self, env: Any, sensors: Any, model: Any = None) -> None:
         super().__init__(sensors=sensors, model=model, _disable_deepcopy=True)
@@ -50,7 +50,7 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
 
 
 class FilterLanes(gymnasium.utils.RecordConstructorArgs):
-    """Filters of the lanes of an environment."""
+    """What both kinds of EstimatedObservation share: a filter of one environment, or of each of many."""
 
     def __init__(
         self, env: Any, model: Any = None, competitor: Any = "extended", show: Any = None, control: Any = None
@@ -78,12 +78,12 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
         return Estimate(*(one[..., : self._estimates.lanes].T for one in self._estimates.state[-1]))
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin episodes, and their filters with the first readings."""
+        """Begin episodes, and return the estimates of their filters after the first readings."""
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[attr-defined]
         return self._estimates.shown.astype(self._dtype), info
 
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
-        """Step, and take the readings in; an action of the filter is behind that of the environment."""
+        """Step with an action, behind which that of the filter is, and return the estimates after the new readings."""
         estimates, applied = self._estimates, action
         if estimates.action_space is not None:
             if not isinstance(self.action_space, gymnasium.spaces.Tuple):  # type: ignore[attr-defined]
@@ -197,7 +197,7 @@ def check_model(model: EnvironmentModel | None, readings: Any, space: Any) -> En
 
 
 def check_shown(show: Any, model: EnvironmentModel) -> tuple[str, ...]:
-    """Return what is shown of an estimate, by default the form of the environment's observation where there is one."""
+    """Return the checked parts to show, by default the form of the environment's observation where there is one."""
     known = PARTS[model.observation is None :]
     show = known[:1] if show is None else (show,) if isinstance(show, str) else tuple(show)
     if not show or not {*show} <= {*known} or len({*show}) != len(show):

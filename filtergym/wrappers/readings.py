@@ -84,7 +84,7 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
 
 
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
-    """Return the places of components that are named, numbered or chosen by a matrix; None for any other h."""
+    """Return the indices of the components that h names, numbers or, as a matrix, selects; None for any other h."""
     if not callable(h) and numpy.shape(h)[1:] == (len(names),):
         rows = numpy.asarray(h, dtype=float)
         is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
@@ -169,7 +169,7 @@ class Readings(Recursion):
         self.available: Array = available.T[self.own]
 
     def begin(self, begins: Array, steps: Array, seeds: Any = None) -> None:
-        """Begin episodes of some lanes, see :meth:`.Recursion.begin`.
+        """Set the seeds of episodes, and begin them, see :meth:`.Recursion.begin`.
 
         Without a seed, one of all or of one, a lane goes on with its next episode, at first of a random seed.
         """
@@ -183,7 +183,7 @@ class Readings(Recursion):
         super().begin(begins, steps)
 
     def _draw(self, first: int, last: int) -> None:
-        """Make the numbers of a step without a compiler."""
+        """Draw the random numbers of a step with NumPy; the arguments are those of the native call."""
         if not self._ahead:
             t = self._times + 1 + numpy.arange(BLOCK)[:, None]
             self._ahead = [*numbers(self._identities, t, *self._counts)[::-1]]

@@ -48,7 +48,7 @@ class Recursion:
         """Calls of a range of lanes that precede every step."""
 
     def bind(self, step: Callable[..., Any], traced: Any, state: Any, given: Array, *inputs: Array) -> None:
-        """Bind a step function to arrays.
+        """Set the step function, and allocate and bind the arrays of its state and outputs.
 
         Args:
             step: function of ``(given, phases, *inputs)`` and the state, arrays of any namespace, that returns the next
@@ -104,11 +104,11 @@ class Recursion:
 
     @property
     def state(self) -> Any:
-        """Copy of the state."""
+        """Copy of the state, ``(..., W)``."""
         return functions.copy_arrays(self._template, self._states[self._leader._now], self._kinds)
 
     def run(self) -> None:
-        """Run a step of all lanes."""
+        """Run a step of all lanes, and that of all followers."""
         if self._left == 0:
             self._left = UNCOUNTED // self._width + 1
             for sequence in self._sequences:

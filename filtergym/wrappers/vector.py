@@ -27,7 +27,7 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin episodes of the environments, of some alone with the option ``reset_mask``, and their readings."""
+        """Begin episodes, of some environments alone with the option ``reset_mask``, and return their readings."""
         mask = (options or {}).get("reset_mask")  # Gymnasium takes it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         lanes = self._every if mask is None else numpy.asarray(mask, dtype=bool)
