@@ -27,7 +27,7 @@ from filtergym.names import find_competitor
 NUMBERS = (100, 200, 1000, 5000)
 """Numbers of episodes of an evaluation."""
 CASES = (
-    ("ManeuveringTarget", "random", ("semi-markov", "bptt")),
+    ("ManeuveringTarget", "random", ("semi-markov", "bptt-strongest")),
     ("ManeuveringTarget", "clutter", ("semi-markov-pda",)),
     ("LooselyCoupledNavigation", "random", ("fault-bank", "kalman-net")),
     ("TightlyCoupledNavigation", "random", ("fault-hypotheses", "bptt-small")),
