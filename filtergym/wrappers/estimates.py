@@ -175,7 +175,7 @@ class Estimates(Recursion):
         deviation = xp.where(is_kept, xp.sqrt(variances), self._deviation)
         estimate = Estimate(mean, deviation, xp.where(is_kept, nis, 0.0), innovation)
         after = select_nested(is_kept, after, self._first)
-        found = step, after, None if waiting is None else past[:-1], estimate
+        found = step, after, None if past is None or waiting is None else past[:-1], estimate
         found = select_nested(phases >= 0.0, found, state)
         parts = {**found[-1]._asdict(), "nis": found[-1].nis[None]}
         if "observation" in self._show:

@@ -204,7 +204,7 @@ class Readings(Recursion):
         if self._model is not None:
             x = xp.asarray(self._model.state(x.T)).T
         for channel, root in zip(self._channels, self._roots, strict=True):
-            L, own = root(x, xp) if callable(root) else root, normals[channel.places]
+            L, own = root if isinstance(root, list) else root(x, xp), normals[channel.places]
             rows += [sum(L[i][k] * own[k] for k in range(i + 1)) for i in range(channel.size)]
         values = xp.concat([h.value(x, xp) for h in self._functions]) + xp.stack(rows)
         if bias is not None:
@@ -236,7 +236,8 @@ class Readings(Recursion):
 def _noise_root(sensor: str, given: Any, count: int, size: int) -> Any:
     """Return the Cholesky factor of R, or a function of states and namespace that does, or raise ValueError."""
     if callable(given):
-        entries = lambda x: [one for row in numpy.reshape(given(x), (count, count)) for one in row]  # noqa: E731
+        rows: Any = given
+        entries = lambda x: [one for row in numpy.reshape(rows(x), (count, count)) for one in row]  # noqa: E731
         function = VectorFunction(entries, size)
         return lambda x, xp: cholesky(xp.reshape(function.value(x, xp), (count, count, -1)))
     R = _noise_matrix(given, count)
