@@ -57,11 +57,11 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and read the sensors."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        readings = self._readings
-        readings.place[...] = observation
-        readings.run()
-        info["available"] = readings.available.astype(bool)
-        return readings.values.astype(self._dtype), reward, terminated, truncated, info
+        own = self._readings
+        own.place[...] = observation
+        own.run()
+        info["available"] = own.available.astype(bool) if own.always is None else own.always.copy()
+        return own.values.astype(self._dtype), reward, terminated, truncated, info
 
 
 class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):

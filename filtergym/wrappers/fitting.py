@@ -46,9 +46,7 @@ def fit_model(
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
     features = 1 + n + p + (n + p) * (n + p + 1) // 2 * (degree == 2)
     if degree not in (1, 2) or steps < 10 * features:
-        raise ValueError(
-            f"degree must be 1 or 2, and steps at least {10 * features:,}, got {degree} and {steps:,}"
-        )
+        raise ValueError(f"degree must be 1 or 2, steps at least {10 * features}, got {degree} and {steps}")
     before, after, action, starts = _roll_out(env, steps, policy, seed)
     change = after - before
     for name, unit in (angles or {}).items():

@@ -124,7 +124,7 @@ class Readings(Recursion):
     Attributes:
         limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
         values: of the last step, ``(m,)`` of one lane, ``(N, m)`` of several.
-        available: 1 where they were received, else 0; of the same shape.
+        available, always: 1 where they were received, else 0; and the same for every step, None where it may differ.
         place: where observations are written before a step, ``(fields,)`` or ``(N, fields)``.
         complete: readings of the last time of which those of all sensors, the slowest too, have been received, and
             behind them 1 where they were made, ``(2 m, W)``.
@@ -167,6 +167,7 @@ class Readings(Recursion):
         self.complete, available, values = self.outputs
         self.place, self.values = observation[self.own], values[self.own]
         self.available: Array = available.T[self.own]
+        self.always = None if late or not is_steady else numpy.ones(self.available.shape, dtype=bool)
 
     def begin(self, begins: Array, steps: Array, seeds: Any = None) -> None:
         """Set the seeds of episodes, and begin them, see :meth:`.Recursion.begin`.
