@@ -1,9 +1,8 @@
-"""A native vector environment as a ``VecEnv`` of Stable-Baselines3.
+"""Adapter of a filtergym vector environment to ``VecEnv`` of Stable-Baselines3.
 
-Stable-Baselines3 has its own ``VecEnv``, older than Gymnasium's vector environments: it resets finished
-environments in the same step and passes their last observation in ``info["terminal_observation"]``. The
-adapter works on whole arrays; only environments that finish in a step need work in Python, and all others share
-one info.
+``VecEnv`` is older than Gymnasium's vector environments: it resets finished environments in the same step and passes
+their last observation in ``info["terminal_observation"]``. The adapter works on whole arrays; all environments that do
+not finish in a step share one info.
 """
 
 import time
@@ -30,17 +29,16 @@ another; with sixteen groups a rollout still covers all parts of an episode even
 def to_sb3(
     vector_env: Any, staggered: bool = False, residual_to: Any = None, gate: Gate | None = None
 ) -> "TaskVecEnv":
-    """Return a native vector environment as a Stable-Baselines3 ``VecEnv``.
+    """Return a filtergym vector environment as a Stable-Baselines3 ``VecEnv``.
 
-    It gives what ``DummyVecEnv`` gives over as many single environments, each in a ``Monitor``, to the last
-    bit: observations, rewards (rounded to float32), dones, and infos with ``TimeLimit.truncated``,
-    ``terminal_observation`` and ``episode`` (return, length, seconds since this object was made).
+    Observations, rewards (rounded to float32), dones and infos equal those of ``DummyVecEnv`` over as many single
+    environments, each in a ``Monitor``.
 
     Args:
         vector_env: environment from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
         staggered: shorten the episodes that a reset starts to lengths spread evenly over the horizon, so that
-            environments finish one group after another instead of all in one step; later episodes are whole. For
-            training only: a score over the shortened ones is not a score of whole episodes.
+            environments finish one group after another; later episodes are whole. For training only: a score over
+            the shortened ones is not a score of whole episodes.
         residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
         gate: gate that decides whether the agent acts; see :mod:`.gate`.
 
@@ -76,7 +74,7 @@ def to_sb3(
 
 
 class TaskVecEnv(VecEnv):
-    """A native vector environment with the interface of Stable-Baselines3, made by :func:`to_sb3`."""
+    """A filtergym vector environment with the interface of Stable-Baselines3, made by :func:`to_sb3`."""
 
     def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env
@@ -97,7 +95,7 @@ class TaskVecEnv(VecEnv):
         self.metadata: dict[str, Any] = env.metadata
 
     def reset(self) -> Any:
-        """Start new episodes with the seeds given to :meth:`seed` and the options given to :meth:`set_options`.
+        """Start an episode in every environment, with the seeds and options set before; return the observations.
 
         Raises:
             ValueError: for options that differ between environments, or other options than "scenario" and "parameters".
@@ -127,7 +125,7 @@ class TaskVecEnv(VecEnv):
         self._seeds = list(seeds)
 
     def step_async(self, actions: numpy.ndarray) -> None:
-        """Store the agent's actions, corrected by policy and gate if there are any, for the next :meth:`step_wait`."""
+        """Store the actions for :meth:`step_wait`, after residual policy and gate, if any, have changed them."""
         if self.residual_to is not None or self.gate is not None:
             shown = self._shown["observation"] if self.env.privileged else self._shown
         if self.residual_to is not None:
@@ -140,7 +138,7 @@ class TaskVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
-        """Step every environment by the stored actions; return observations, rewards, dones and infos."""
+        """Step every environment with the stored actions; return observations, rewards, dones and infos."""
         observation, reward, _, finished, info = self.env.step(self._actions)
         self.returns += reward
         self.lengths += 1
@@ -171,7 +169,7 @@ class TaskVecEnv(VecEnv):
     # --- whole state, for checkpoints
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state on which later steps depend: episodes, running returns, memory of a corrected policy.
+        """Return the state on which later steps depend: episodes, running returns, memories of policy and gate.
 
         Returns and memory are shared with this object, so pickle the snapshot before the next step.
         """

@@ -1,17 +1,15 @@
-"""Learning through the filter: a small network trained on the gradient of the episode's cost.
+"""Training through the filter: a small network learns from the gradient of the episode's cost.
 
 A task is differentiable from the action to the reward of every later measurement. So no value function and no
 exploration are needed: the mean cost of a batch of episodes is differentiated through filter and policy
 (back-propagation through time) and minimised by Adam. In long episodes the gradient is truncated every ``truncation``
-decisions (truncated back-propagation): the states continue, the gradients do not flow further back.
+decisions: the states continue, the gradients do not flow further back.
 
-Compiled episodes are differentiated by the code of :mod:`.unrolled`, with the same gradients as torch's and several
-times as fast; a task that cannot be compiled runs on torch tensors.
+Compiled episodes are differentiated by :mod:`.unrolled`, with torch's gradients and several times as fast; a task that
+cannot be compiled runs on torch tensors. The network is a linear rule, has one hidden layer, or a memory (``network``);
+a fast one reads only the few fields with the largest weights at the end of its training (``fields_kept``).
 
-The network is a linear rule, has one hidden layer, or a memory (``network``). A fast network reads only a few fields of
-the observation at the end of its training (``fields_kept``), those with the largest weights.
-
-A learned estimator (``kalman-net``) is trained by the same descent: its network acts on a filter of its own.
+A learned estimator (``kalman-net``) is trained in the same way: its network acts on a filter of its own.
 """
 
 import functools
@@ -123,7 +121,7 @@ class NetworkPolicy(torch.nn.Module):
 
     @property
     def layers(self) -> list[torch.nn.Linear]:
-        """Linear layers in order, after the memory if there is one; tanh follows the last, the rectifier the others."""
+        """Linear layers from input to output, after the memory; tanh follows the last, ReLU the others."""
         return [*cast("Iterable[torch.nn.Linear]", self.hidden), self.head]
 
     @property
@@ -145,7 +143,7 @@ class NetworkPolicy(torch.nn.Module):
         return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(features))), memory
 
     def strongest_fields(self, count: int) -> numpy.ndarray:
-        """Return the indices of the fields with the largest weights among those in use, in ascending order.
+        """Return the ascending indices of the ``count`` fields with the largest weights among those in use.
 
         Observations are normalised, so that a small weight means a small influence (magnitude pruning).
         """
@@ -159,9 +157,7 @@ class NetworkPolicy(torch.nn.Module):
         self.used[numpy.setdiff1d(numpy.arange(len(self.used)), self.strongest_fields(count))] = 0.0
 
     def arrays(self) -> dict[str, numpy.ndarray]:
-        """Return the network's arrays by name, as in a file, restricted to the observation fields with largest
-        weights.
-        """
+        """Return the network's arrays by their names in an agent's file, of the strongest fields alone."""
         columns = self.strongest_fields(self.fields_kept)
         named = {"observation_mean": self.mean[columns], "observation_scale": self.scale[columns]}
         if self.gru is not None:
@@ -178,7 +174,7 @@ class NetworkPolicy(torch.nn.Module):
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
     def fields(self, model: Model) -> list[str]:
-        """Return the names of the observation fields that the saved agent reads."""
+        """Return the names of the observation fields that the agent reads once it is saved."""
         return [model.fields[i].name for i in self.strongest_fields(self.fields_kept)]
 
 
@@ -197,12 +193,12 @@ def descend_episodes(
         env: environments with torch backend and autoreset mode "Disabled".
         policy: the policy, to whose gradients are added.
         truncation: decisions through which the gradient flows back.
-        descend: function that uses and clears the policy's gradients. It is called every ``truncation`` decisions and
-            at the end, when they are those of the mean cost of a decision since the last call.
+        descend: function that uses and clears the policy's gradients, those of the mean cost of a decision since its
+            last call. It is called every ``truncation`` decisions and at the end.
         gate: gate that decides whether the policy acts; other decisions have no gradient.
-        largest: norm to which the gradient of an episode's costs since the last call with respect to one of its actions
-            is clipped. In episodes that lose the track the gradient grows with every decision that it flows back:
-            without clipping, few episodes dominate the sum.
+        largest: norm to which the gradient of a window's costs with respect to one action of an episode is clipped. In
+            episodes that lose the track the gradient grows with every decision that it flows back: without clipping,
+            few episodes dominate the sum.
         penalty: cost, in the unit of the reward, of an action whose numbers have the sum of squares one. It keeps
             actions near zero, the filter itself, where they gain little.
 
@@ -244,7 +240,7 @@ def descend_episodes(
 
 
 def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
-    """Set the policy's normalisation to mean and deviation of the observations under its first actions."""
+    """Set the input normalisation of a policy to mean and deviation of the observations that its own actions cause."""
     observation, _ = env.reset()
     hidden = policy.new_memory(env.num_envs)
     seen = []
@@ -260,7 +256,7 @@ def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
 
 
 def _environment(run: TrainingRun) -> TaskVectorEnv:
-    """Return the environments of a run that can be differentiated, with compiled backend where possible."""
+    """Return the differentiable environments of a run: compiled where possible, else on torch."""
     make = functools.partial(
         TaskVectorEnv,
         run.environment,
@@ -291,13 +287,13 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
 
 
 def _reward_to_descend(run: TrainingRun) -> str:
-    """Return the name of the reward to differentiate: of ``relative`` that is ``cost``, which has the same gradient."""
+    """Return the name of the reward to differentiate; ``relative`` has the same gradient as ``cost``."""
     kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
     return "cost" if kind == "relative" else kind
 
 
-def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
-    """Return the objective of a run's training: the reward, and the share of a teacher's estimates.
+def _training_objective(run: TrainingRun) -> TrainingObjective:
+    """Return the objective of a run: its reward, and the share of a teacher's estimates in it.
 
     Raises:
         ValueError: if a student cannot be trained with this reward.
@@ -318,7 +314,7 @@ def _make_agent(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
 
 
 class Descent:
-    """The network of a run with its environments, optimiser and progress.
+    """State of a training run through the filter: network, environments, optimiser and number of steps.
 
     Args:
         run: the run; its ``backend`` is set to that of the environments.
@@ -356,14 +352,14 @@ class Descent:
         step_eagerly(self.optimiser)
         self.steps_done: int = 0
 
-    def flight(self) -> Callable[[Callable[[], None]], float]:
-        """Return a function that simulates an episode in every environment, descends, and returns the mean cost."""
+    def episode_function(self) -> Callable[[Callable[[], None]], float]:
+        """Return a function that simulates episodes, calls its argument at each gradient step, and returns the cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
         teacher, penalty = self.values.get("teacher"), self.values.get("action_penalty", 0.0)
         check("action_penalty", penalty, float, ParameterLimits(at_least=0.0))
         if env.backend == "compiled":
-            reward = _reward_with_teacher(self.run)
+            reward = _training_objective(self.run)
             beside = None if teacher is None else Teacher(env, teacher)
             return Unrolled(env, policy, truncation, reward, beside, gate, largest, penalty).descend_episodes
         if teacher is not None:
@@ -375,14 +371,14 @@ class Descent:
         )
 
     def update(self) -> float:
-        """Do an optimiser step along the accumulated gradient, and return the gradient's norm."""
+        """Clip the accumulated gradient, do an optimiser step, and return the gradient's norm before clipping."""
         norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.values["max_grad_norm"])
         self.optimiser.step()
         self.optimiser.zero_grad()
         return float(norm)
 
     def follow_schedule(self) -> None:
-        """Set the learning rate and the observation fields in use for the current share of the run."""
+        """Set the learning rate, and prune observation fields, for the share of the run that is done."""
         done, policy = self.steps_done / self.run.steps, self.policy
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(1.0 - done)
@@ -403,7 +399,7 @@ class Descent:
         return Trainee(steered, self.save_checkpoint, save_agent)
 
     def save_checkpoint(self, folder: Path) -> None:
-        """Write a checkpoint into a folder: everything on which later steps depend."""
+        """Write a checkpoint into a folder: network, optimiser, random generators and number of steps."""
         generators = [generator.bit_generator.state for generator in self.env.fleet.generators]
         kept = {
             "policy": self.policy.state_dict(),
@@ -436,14 +432,9 @@ class Descent:
 
 
 def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train through the filter until ``run.steps`` environment steps, or Ctrl-C or SIGTERM; return the run.
+    """Train a network by gradients through the filter up to ``run.steps``, or Ctrl-C or SIGTERM; return the run.
 
-    Args:
-        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
-        session: settings of the session.
-
-    Raises:
-        ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
+    A control with discrete actions, and a checkpoint that cannot be read, raise ValueError.
     """
     if session.resume and run.is_complete:
         return run
@@ -453,7 +444,7 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
         descent.load_checkpoint(session.folder / "checkpoint")
     else:
         measure_normalisation(descent.env, descent.policy)
-    fly = descent.flight()
+    fly = descent.episode_function()
     logger = make_logger(session.folder / "log", descent.steps_done)
 
     def descend() -> None:

@@ -1,8 +1,7 @@
 """Ranges of the observations in an agent's training, and the comparison of later observations with them.
 
-A network has an output for any input. Its envelope is the range of each field in its training. The file of an exported
-agent contains it; for other agents some hundred episodes of the training distribution are simulated again. Later
-observations are compared with the envelope field by field.
+A network has an output for any input. Its envelope is the range of each field in its training: stored in the file of an
+exported agent; for other agents some hundred episodes of the training distribution are simulated again.
 """
 
 import math
@@ -55,9 +54,7 @@ class TrainingRange(NamedTuple):
     """Largest values, ``(fields,)``."""
 
     def is_outside(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return a boolean mask of the values of observations ``(n, fields)`` outside the range; NaN counts as
-        outside.
-        """
+        """Return whether each value of observations ``(n, fields)`` is outside the range, or NaN."""
         return numpy.logical_not((observation >= self.low) & (observation <= self.high))
 
 
@@ -66,10 +63,6 @@ class EnvelopeAlarm(Alarm):
 
     In training a value of a field lies outside once in ``1 / USUAL`` decisions or less; in other distributions half of
     the values do. The alarm sums the log-likelihood ratios of each field.
-
-    Args:
-        model: the model whose observations are passed.
-        range: range of the training.
     """
 
     def __init__(self, model: Model, range: TrainingRange) -> None:
@@ -78,7 +71,7 @@ class EnvelopeAlarm(Alarm):
         self.columns: list[int] = model.columns(range.fields)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratio of each field, ``(N, fields)``."""
+        """Return the log-likelihood ratio of each field, other task against training, ``(N, fields)``."""
         outside = self.range.is_outside(observation[:, self.columns])
         return numpy.where(outside, math.log(OFTEN / USUAL), math.log((1.0 - OFTEN) / (1.0 - USUAL)))
 
@@ -103,7 +96,7 @@ class NetworkWatch:
         self.memory: numpy.ndarray | None = None
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Update the shares of values outside the range with observations ``(tracks, fields)``."""
+        """Update the shares of values outside the range with the observations ``(tracks, fields)`` of a decision."""
         outside = self.range.is_outside(observation[:, self.columns])
         before = 0.0 * outside if self.memory is None else self.memory
         if start.any():
@@ -111,7 +104,7 @@ class NetworkWatch:
         self.memory = before + (outside - before) / WINDOW
 
     def describe(self) -> list[str]:
-        """Return a sentence for each track on the field that is most often outside; empty where none is too often."""
+        """Return a warning for each track on the field that is most often outside; empty where none is too often."""
         if self.memory is None:
             return []
         most, share = self.memory.argmax(axis=1), self.memory.max(axis=1)
@@ -127,12 +120,7 @@ class NetworkWatch:
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
     """Return the range of each observation field in an agent's training, as stored, else from simulated episodes.
 
-    Args:
-        cls: the task.
-        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
-
-    Returns:
-        The range; None if the training is unknown, or was on a mixture of scenarios and the file has no range.
+    None: unknown training, or a mixture of scenarios without a stored range.
     """
     stored = _stored(maker)
     if stored is None:
@@ -149,21 +137,21 @@ def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
 
 
 def _stored(maker: Any) -> Any:
-    """Return the stored policy inside the maker of an agent; None if its training is unknown."""
+    """Return the stored policy inside an agent's factory; None if its training is unknown."""
     for inside in ("maker", "policy"):  # of a gate, of an estimator
         maker = getattr(maker, inside, maker)
     return maker if getattr(maker, "header", None) is not None else None
 
 
 def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the task parameters of an agent's training by name, from the record of its run."""
+    """Return the task parameters of an agent's training by name, from its run's record."""
     known = parameter_names(cls)
     given = run.get("hyperparameters", {}).get("env_kwargs", {})
     return {name: value for name, value in given.items() if name in known}
 
 
 class Departure(NamedTuple):
-    """Difference between the task in which an agent acts and its training."""
+    """Difference between the task in which an agent acts and its training: values outside, and parameters."""
 
     share: float
     """Share of the values of one field outside the range of training: the field with the largest share."""
@@ -184,17 +172,7 @@ class Departure(NamedTuple):
 
 
 def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str, Any]) -> Departure | None:
-    """Return how the task in which an agent is to act differs from its training; None if it does not.
-
-    Args:
-        cls: the task.
-        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
-        scenario: the scenario that the agent is to act in.
-        keywords: parameters of the task there.
-
-    Returns:
-        The difference; None if the task is within the training, or the training is unknown.
-    """
+    """Return how the task in which an agent is to act differs from its training; None: not at all, or unknown."""
     stored = _stored(maker)
     if stored is None or find_mixture(cls, stored.header["run"].get("scenario")) is not None:
         return None
@@ -222,7 +200,7 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
 def _observations(
     cls: type[Task], stored: Any, scenario: Any, keywords: Mapping[str, Any], seeds: Sequence[int]
 ) -> numpy.ndarray:
-    """Return the observations of an agent at all decisions of some episodes that it controls, ``(n, fields)``."""
+    """Simulate episodes that an agent controls; return its observations at all decisions, ``(n, fields)``."""
     model = make_model(cls, stored.control, scenario, backend="auto", **keywords)
     lanes = start_lanes(model, seeds)
     policy = SteppingPolicy(model, make_competitor(stored, model))
@@ -236,13 +214,13 @@ def _observations(
 
 
 def observe_network(model: Model, episode: Episode) -> Array:
-    """Return the observation of a learned estimator's network after a measurement, in a closed loop."""
+    """Return the observation that a learned estimator's network receives after a measurement."""
     own, received = model.filter.own, fill_missing(model.task.world.mask_missing(episode.measurement))
     return own.model.observe(Episode(None, received, episode.filter.own.bank))
 
 
 def watch_live(model: Model, maker: Any, kind: Kind) -> NetworkWatch | None:
-    """Return a monitor that compares a live agent's observations with its training; None: unknown range."""
+    """Return a monitor of a live agent's observations against its training range; None: unknown range."""
     seen = training_range(type(model.task), maker)
     if seen is None:
         return None

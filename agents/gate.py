@@ -1,14 +1,14 @@
 """Gates that use an agent only while an alarm is active and the observations resemble its training.
 
-Where filters and sensors are as modelled, a classical filter is hard to beat and easy to harm. The output of a network
-far from its training data is unpredictable. So the gate trusts an agent under two conditions: an alarm
-(:mod:`..baselines.alarm`) has sounded within the last decisions, and the observations lie within the range of the
-training (:mod:`.envelope`). An agent that is not trusted still runs, so that its memory covers the whole episode.
+Where filters and sensors are as modelled, a classical filter is hard to beat and easy to harm, and the output of a
+network far from its training data is unpredictable. So an agent is trusted if an alarm (:mod:`..baselines.alarm`) has
+sounded within the last decisions, and the observations lie within the range of the training (:mod:`.envelope`). Without
+trust an agent still runs, so that its memory covers the whole episode.
 
-There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and returns the
-estimate of the trusted one (:class:`GatedEstimator`). The fallback may be any policy or estimator, whatever the agent
-controls; in a closed loop the vehicle follows the trusted estimate. In training (``--gated``) both share one filter,
-and the gate replaces the agent's action (:class:`Gated`): the fallback is an action of the same control.
+``gated:NAME`` runs two filters side by side, the agent's and a classical one, and returns the estimate of the trusted
+one (:class:`GatedEstimator`). The fallback may be any policy or estimator; in a closed loop the vehicle follows the
+trusted estimate. In training (``--gated``) both share one filter, and the gate replaces the agent's action
+(:class:`Gated`): the fallback is an action of the same control.
 """
 
 import math
@@ -84,7 +84,7 @@ class FallbackAction(ConstantPolicy):
 
 
 class TrustMemory(NamedTuple):
-    """Memory of the alarms of N episodes."""
+    """Memory of a :class:`Trust` for N episodes: its alarms, and for how long they are active."""
 
     alarm: Any
     envelope: Any
@@ -123,18 +123,13 @@ class Trust:
             raise ValueError(f"window must be at least one decision, got {self.window!r}")
         self.envelope: EnvelopeAlarm | None = None if envelope is None else EnvelopeAlarm(model, envelope)
 
-    def listen(
+    def update(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, TrustMemory]:
-        """Update the alarms with an observation; return a boolean mask of the lanes in which the agent is trusted.
+        """Update the alarms with observations ``(N, fields)``; return the mask ``(N,)`` of trusted lanes, and memory.
 
-        Args:
-            observation: ``(N, fields)``.
-            memory: memory returned by the last call; None at the first.
-            start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Booleans ``(N,)``, and memory.
+        ``start`` is true where an episode begins, ``(N,)``; ``memory`` is that of the last call, None at the
+        first.
         """
         none = 0.0 * observation[:, 0]
         alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
@@ -154,14 +149,14 @@ class Trust:
 
 
 class GateMemory(NamedTuple):
-    """Memory of a gate: alarms, fallback policy."""
+    """Memory of a :class:`Gate`: that of its alarms, and that of the fallback policy."""
 
     trust: TrustMemory | None
     fallback: Any
 
 
 class Gate:
-    """Choice in training between an agent's action and a fallback's, by the agent's trust.
+    """Switch in training between the actions of an agent and of a fallback, by whether the agent is trusted.
 
     Args:
         model: the model whose observations are passed.
@@ -185,7 +180,7 @@ class Gate:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
-        """Return the gate's memory at the start of the episodes with these seeds."""
+        """Return the memory of a gate at the start of the episodes with these seeds."""
         return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
@@ -197,17 +192,11 @@ class Gate:
     ) -> tuple[numpy.ndarray, numpy.ndarray, GateMemory]:
         """Return the agent's actions where the gate is open and the fallback's elsewhere, the mask, and the memory.
 
-        Args:
-            observation: ``(N, fields)``.
-            action: the agent's actions, batch first.
-            memory: memory returned by the last call; None at the first.
-            start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Actions, batch first; whether the gate is open, booleans ``(N,)``; and memory.
+        Actions are batch first; ``start`` is true where an episode begins; ``memory`` is that of the last
+        call, or None.
         """
         memory = self.begin(range(len(observation))) if memory is None else memory
-        opened, trust = self.trust.listen(observation, memory.trust, start)
+        opened, trust = self.trust.update(observation, memory.trust, start)
         other, fallback = self.fallback.predict(observation, memory.fallback, start, deterministic=True)
         aligned = opened.reshape(-1, *[1] * (numpy.ndim(action) - 1))
         return numpy.where(aligned, action, other), opened, GateMemory(trust, fallback)
@@ -262,7 +251,7 @@ class Gated(Policy):
 
 
 class MonitoredMemory(NamedTuple):
-    """Memory of a policy and of its alarms."""
+    """Memory of a :class:`MonitoredPolicy`: that of the policy, that of its alarms, and the mask of trust."""
 
     policy: Any
     trust: TrustMemory
@@ -271,13 +260,7 @@ class MonitoredMemory(NamedTuple):
 
 
 class MonitoredPolicy(Policy):
-    """A policy whose memory includes whether it is trusted; its actions do not change.
-
-    Args:
-        policy: an object with Stable-Baselines3's ``predict``.
-        trust: the rule that trusts the policy.
-        model: the model of both.
-    """
+    """A policy whose memory includes whether it is trusted; its actions do not change."""
 
     def __init__(self, policy: Any, trust: Trust, model: Model) -> None:
         super().__init__(model)
@@ -291,12 +274,12 @@ class MonitoredPolicy(Policy):
         """Return the policy's actions unchanged, and the memory with the mask of trust."""
         memory, trust = (None, None) if state is None else state[:2]
         action, memory = self.policy.predict(observation, memory, start, deterministic=True)
-        trusted, trust = self.trust.listen(observation, trust, start)
+        trusted, trust = self.trust.update(observation, trust, start)
         return action, MonitoredMemory(memory, trust, trusted)
 
 
 class GatedState(NamedTuple):
-    """State of a gated filter."""
+    """State of a :class:`GatedEstimator`: both filters, the mask of trust, and the evidence for each filter."""
 
     agent: Any
     """State of the agent's filter."""
@@ -325,9 +308,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
     larger by one factor. Persistent errors hardly change the innovations and are not corrected. The agent's covariance
     is not scaled: its innovations are those before its action.
 
-    Args:
-        agent: a filter whose policy is a :class:`MonitoredPolicy`.
-        fallback: a filter.
+    The policy of ``agent`` is a :class:`MonitoredPolicy`.
     """
 
     def __init__(self, agent: LearnedEstimator, fallback: Filter[Any, Any, Any]) -> None:
@@ -382,21 +363,16 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
 
     def covariance(self, state: GatedState) -> Array:
-        """Return the trusted filter's covariance in each lane, ``(C, C, N)``; the fallback's times its variance
-        factor.
-        """
+        """Return the trusted filter's covariance ``(C, C, N)``; the fallback's is scaled by its variance factor."""
         other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
         return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
 
     def records(self, state: GatedState, measurement: Any) -> dict[str, Array]:
-        """Return no records: the estimate changes between two filters."""
+        """Return no records: the estimate switches between two filters."""
         return {}
 
     def _sum_squares(self, memory: GatedState, likelihood: Likelihood) -> tuple[Array, Array]:
-        """Return the sums of the fallback's normalised innovations squared, and of their degrees of freedom.
-
-        A missing measurement, or one without these numbers, does not change them.
-        """
+        """Add a measurement's NIS and degrees of freedom to the fallback's fading sums; missing ones add nothing."""
         if self.fallback.adapts_covariance or likelihood.nis is None or likelihood.nis_degrees is None:
             return memory.squares, memory.degrees
         xp, keep = self.xp, 1.0 - 1.0 / NIS_MEMORY
@@ -417,12 +393,12 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
 
 
 def is_gateable(maker: Any) -> bool:
-    """Return whether a competitor has actions that depend on measurements, which a gate can replace."""
+    """Return whether a gate can guard a competitor: a learned estimator, or any policy but the random one."""
     return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
 
 
 class GatedMaker:
-    """Maker of an agent behind a gate, which an evaluation calls with a task.
+    """Factory of an agent behind a gate; an evaluation calls it with a task.
 
     Args:
         problem: the problem of agent and fallback.
@@ -490,12 +466,7 @@ class GatedMaker:
             )
 
     def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
-        """Return the gated estimator for a task.
-
-        Args:
-            task: the task.
-            replace: function from the agent's policy to its replacement.
-        """
+        """Return the gated estimator for a task; ``replace`` maps the agent's policy to a replacement."""
         model = Model(task, self.control)
         shown = model.on_numpy()
         policy = check_competitor(self.name, make_competitor(self._policy, shown), "policy")
@@ -530,14 +501,9 @@ def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
 
 
 def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
-    """Return a competitor's relative excess cost over the paper's on validation episodes, and its standard errors.
+    """Return a competitor's relative excess cost over the paper's algorithm, and that in standard errors.
 
-    Args:
-        problem: the problem of both; the episodes are of its training distribution.
-        fallback: name of the competitor.
-
-    Returns:
-        Difference of the mean costs over the paper's, and the difference in standard errors over paired episodes.
+    The episodes are validation episodes of the training distribution.
     """
     if fallback == problem.paper:
         return 0.0, 0.0
@@ -545,12 +511,9 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 
 
 class PolicyMaker:
-    """Maker of a wrapped policy, which is called with a model.
+    """Factory of a wrapped policy, which is called with a model.
 
-    Args:
-        maker: the policy inside, or a factory of it.
-        wrap: function from the model and the policy inside to the wrapped policy.
-        control: control of both; default: the maker's own.
+    ``wrap`` maps a model and the policy inside to the wrapped policy.
     """
 
     kind = "policy"
@@ -586,6 +549,6 @@ def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool
 
 
 def find_gated(name: str, inner: str, problem: Problem, find: Callable[[str], Competitor]) -> Competitor:
-    """Return the competitor ``gated:NAME``: the agent ``inner`` beside the environment's fallback."""
+    """Return the competitor ``gated:NAME``: the agent ``inner`` behind a gate, with the environment's fallback."""
     policy = find(inner)
     return Competitor(name, GatedMaker(problem, inner, policy.maker), policy.learned)

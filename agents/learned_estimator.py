@@ -1,7 +1,7 @@
 """A learned estimator: a filter with a network inside, as plain arrays.
 
 The filter is a bank of the environment (:class:`.TrainedBanks`), and the network is a learned policy that acts in it.
-The interface has neither observations nor actions: the input is measurements, the output mean and covariance.
+The interface has neither observations nor actions: measurements in, mean and covariance out.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,9 @@ from ..evaluation.competitors.steered_filter import PolicyFilterState, SteeredFi
 
 
 class LearnedEstimator(SteeredFilter):
-    """A bank with the policy that acts in it; missing values are passed as zeros.
+    """Filter made of a bank and the network that steers it; missing values of a measurement count as zeros.
 
-    Args:
-        model: model with the bank.
-        network: policy for the bank, on NumPy.
-        interval: measurements for which an action is held.
+    ``interval`` is the number of measurements for which an action is held.
     """
 
     def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
@@ -31,11 +28,11 @@ class LearnedEstimator(SteeredFilter):
         self.network = network
 
     def predict(self, state: PolicyFilterState, measurement: Any) -> PolicyFilterState:
-        """Return the bank's state predicted to a measurement, with zeros for missing values."""
+        """Return the state predicted to a measurement, with zeros for missing values."""
         return super().predict(state, fill_missing(measurement))
 
     def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
-        """Run the network on the measurement, update the bank with its action, and return the state."""
+        """Run the network on a measurement, update the bank under its action, and return the state."""
         return super().update(state, FilterInput(fill_missing(inputs.measurement)))
 
 
@@ -45,11 +42,9 @@ def fill_missing(measurement: Any) -> Any:
 
 
 class EstimatorMaker:
-    """Maker of a learned estimator, which an evaluation calls with a task.
+    """Factory of a learned estimator; an evaluation calls it with a task.
 
-    Args:
-        bank: name of the filter among the trained banks of the task.
-        policy: factory of the network for a model of that bank.
+    ``policy`` is the network's factory, for a model of the bank.
     """
 
     kind: ClassVar[Kind] = "estimator"

@@ -1,11 +1,10 @@
 """Learned policies as plain arrays: NumPy inference, no torch, nothing executed on load.
 
-A file is in the safetensors form: arrays, and a header of strings. ``observation_mean`` and
-``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
-(reset, update, new), ``lstm_*`` a long short-term memory (input, forget, cell, output), ``weight_i`` and
-``bias_i`` the layers after it. ``envelope_low`` and ``envelope_high``, of an exported agent, are the range of each
-field in its training. The header names the environment, the control and the fields of the observation. The agent
-selects its columns by these names, independent of their order and of other fields.
+A file is in the safetensors form: arrays, and a header of strings. ``observation_mean`` and ``observation_scale``
+normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout (reset, update, new), ``lstm_*`` a
+long short-term memory (input, forget, cell, output), ``weight_i`` and ``bias_i`` the layers after it, ``envelope_low``
+and ``envelope_high`` of an exported agent the range of each field in its training. The header names the environment,
+the control and the fields of the observation, by which the agent selects its columns.
 """
 
 import json
@@ -50,10 +49,9 @@ ROWS = 8
 
 
 def _product(rows: numpy.ndarray, weight: numpy.ndarray) -> numpy.ndarray:
-    """Return ``rows @ weight.T``, computed in matrix products of one shape so that rounding is reproducible.
+    """Return ``rows @ weight.T`` in products of one shape, so that rounding does not depend on the number of rows.
 
-    BLAS rounds by the shape, and an observation's action must not depend on the number of others. The compiler makes a
-    loop of traced rows.
+    The compiler makes a loop of traced rows.
     """
     if not isinstance(rows, numpy.ndarray):
         return rows @ weight.T
@@ -192,13 +190,7 @@ def write_arrays(
 
 
 def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
-    """Add the range of each field in training to a learned policy's file.
-
-    Args:
-        path: the file.
-        low: smallest values, ``(fields,)``.
-        high: largest values, ``(fields,)``.
-    """
+    """Add the training range of each field, ``low`` to ``high`` of shape ``(fields,)``, to a learned policy's file."""
     from safetensors import safe_open
     from safetensors.numpy import save
 
@@ -240,7 +232,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
         if not has_type(header["fields"], list[str]):
             raise ValueError("its header has no list of fields")
         _check_run(header["run"])
-        header["answers"] = _count_answers(arrays, len(header["fields"]))
+        header["answers"] = _count_outputs(arrays, len(header["fields"]))
     except FileNotFoundError as error:
         raise ValueError(f"no learned policy at {path}") from error
     except (SafetensorError, ValueError, TypeError, AttributeError, KeyError) as error:
@@ -249,11 +241,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
 
 
 def _check_run(run: Any) -> None:
-    """Raise ValueError unless the run's record in a file's header has the right types.
-
-    Raises:
-        ValueError: for a value of another type.
-    """
+    """Raise ValueError unless the run's record in a file's header has the right types."""
     if not isinstance(run, dict):
         raise ValueError("its header has no record of a run")
     for name, hint in get_type_hints(TrainingRun).items():
@@ -265,15 +253,11 @@ def _check_run(run: Any) -> None:
         raise ValueError("env_kwargs of its run must map names to values")
 
 
-def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
-    """Return the number of a network's outputs; raise ValueError unless its arrays fit together.
-
-    Args:
-        arrays: arrays of the file.
-        width: number of fields of the observation.
+def _count_outputs(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
+    """Check that the arrays of a network fit together, and return its number of outputs.
 
     Raises:
-        ValueError: if an array is missing or unknown, or its shape does not match the others.
+        ValueError: if an array is missing or unknown, or does not fit the others or a ``width`` of so many fields.
     """
     expected: dict[str, tuple[int, ...]] = {"observation_mean": (width,), "observation_scale": (width,)}
     for unit, gates in (("gru", 3), ("lstm", 4)):
@@ -303,7 +287,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
 
 
 class StoredPolicy:
-    """Maker of the policy in a file, which an evaluation calls with a model."""
+    """Factory of the learned policy in a file; an evaluation calls it with a model."""
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = read_arrays(path)
@@ -317,7 +301,7 @@ class StoredPolicy:
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """Task parameters of its training that set the range of its actions (:class:`.Actions`)."""
+        """Task parameters of the policy's training that set the range of its actions (:class:`.Actions`)."""
         reach = action_reach(task_class(self.header["environment"]), self.control)
         return {name: value for name, value in self._keywords.items() if name in reach}
 
@@ -336,7 +320,7 @@ class StoredPolicy:
                 )
 
     def __call__(self, model: Model) -> Policy:
-        """Return the policy for a model, with the policy that it corrects and its gate."""
+        """Return the policy for a model, wrapped as in its training (corrected policy, gate)."""
         if self.header["interface"] != str(model.task.interface):
             raise ValueError(
                 f"{self.path} was trained with another meaning of the fields or actions of {model.task.id} (its "
@@ -362,7 +346,7 @@ class StoredPolicy:
 
 
 def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
-    """Return the maker of a learned policy or estimator, loaded from a file of an environment.
+    """Return the factory of the learned policy or estimator in a file; it must be of the environment ``cls``.
 
     Raises:
         ValueError: if the file is not a learned policy, or belongs to another environment.

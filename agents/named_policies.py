@@ -20,17 +20,14 @@ def pretrained_agents(id: str) -> list[str]:
 
 
 def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
-    """Return the maker of the learned policy of a name, file or folder; None for another name.
+    """Return the factory of the learned policy of a name, file or folder; None for another name.
 
     Args:
         cls: the environment.
-        name: name of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
-            Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, which
-            means its best agent.
+        name: name of a shipped agent (``ppo``, ``bptt``); a ``.safetensors`` file, or the ``.zip`` of a
+            Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, for its
+            best agent.
         trust: whether to load a zip.
-
-    Raises:
-        ValueError: if the content of the file or folder does not match its name, or needs ``trust``.
     """
     if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
@@ -51,11 +48,7 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
 
 
 def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
-    """Return a model of Stable-Baselines3, loaded from its zip: the network alone.
-
-    Raises:
-        ValueError: if the file is not a model, or is not trusted.
-    """
+    """Return a Stable-Baselines3 model from its zip, without residual policy or gate."""
     try:
         from .sb3_policy import load_sb3_policy
     except ImportError as error:
@@ -81,7 +74,7 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
 
 
 def _wrap_as_in_run(model: Any, run: TrainingRun) -> Any:
-    """Return the maker of a model's policy as in its run: with corrected policy, gate, and range of actions."""
+    """Return the factory of a model's policy as in its run: with corrected policy, gate, and range of actions."""
     reach = action_reach(run.problem.task, run.control)
     model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):

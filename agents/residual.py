@@ -16,7 +16,7 @@ from ..evaluation.competitors.kinds import Policy, expose_spaces, is_traceable, 
 
 
 def check_residual(model: Model, policy: Any) -> None:
-    """Raise ValueError if actions of this task and policy cannot be added."""
+    """Raise ValueError if an agent's actions cannot be added to a policy's: another control, or discrete actions."""
     if not isinstance(model.action_space, gymnasium.spaces.Box):
         raise ValueError(
             f"a residual action needs a continuous control: {model.control!r} has {model.action_space}, choose another"
@@ -82,7 +82,7 @@ class ResidualPolicy(Policy):
         return first, second
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the sum of the policy's and the agent's actions, clipped, and both memories."""
+        """Return the sum of the policy's and the agent's actions, and both memories."""
         memory, agent_memory = (None, None) if state is None else state
         own, memory = self.policy.predict(observation, memory, start, deterministic=True)
         correction, agent_memory = self.agent.predict(observation, agent_memory, start, deterministic=True)

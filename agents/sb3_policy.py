@@ -1,7 +1,7 @@
 """Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation of their training.
 
-A model that was trained under ``VecNormalize`` needs normalised observations, and its zip does not contain the
-statistics: they are in a file of their own. With raw observations such a model runs without an error, but badly.
+The zip of a model trained under ``VecNormalize`` lacks the statistics: they are in a file of their own. With raw
+observations such a model runs without an error, but badly.
 """
 
 import pickle
@@ -73,7 +73,7 @@ class Sb3Policy:
         self.observation_space: Any = model.observation_space
         self.action_space: Any = model.action_space
         self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
-        self.task_keywords: dict[str, Any] = _reach(model)
+        self.task_keywords: dict[str, Any] = _action_range(model)
         if control is not None:
             self.control = control
         name = name or f"this model of {type(model).__name__}"
@@ -100,15 +100,15 @@ class Sb3Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Return actions for raw observations, with the interface of Stable-Baselines3."""
+        """Return a model's actions for raw observations, which it normalises as in training, and its memory."""
         if self.normalisation is not None:
             normalised: Any = self.normalisation.normalize_obs(observation)
             observation = normalised
         return self.model.predict(observation, state, episode_start, deterministic)
 
 
-def _reach(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the task parameters that set the range of actions in a model's environment, if not default."""
+def _action_range(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return the task parameters that set the range of actions in a model's environment, where not default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped
     env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
@@ -131,11 +131,10 @@ def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
 def was_trained_normalised(model: BaseAlgorithm) -> bool:
     """Return whether a model was trained on normalised observations, as far as its stored observations show.
 
-    A model stores its last observation and, under ``VecNormalize``, the original of it. Algorithms with a replay buffer
-    store an earlier observation in its place without ``VecNormalize``, too. ``VecNormalize`` returns float32. So with
-    float64 observations the two types decide exactly. With float32 observations an algorithm without replay buffer is
-    detected, even if only rewards were normalised, and one with a replay buffer is not. A model without training is not
-    detected either.
+    A model stores its last observation and, under ``VecNormalize``, the original of the float32 one.
+    So with float64 observations the two types decide. With float32 an algorithm without replay buffer is
+    detected, even if only rewards were normalised; one with a replay buffer stores an earlier observation there without
+    ``VecNormalize``, too, and is not detected, nor is a model without training.
     """
     shown, original = model._last_obs, model._last_original_obs
     if not isinstance(original, numpy.ndarray):
@@ -154,12 +153,7 @@ def _is_wrapped(model: BaseAlgorithm) -> bool:
 
 
 def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
-    """Yield the paths of files that may contain the normalisation of a model's zip, most specific first.
-
-    Args:
-        path: path of the zip.
-        environment: id of the model's environment.
-    """
+    """Yield the paths of files that may contain the normalisation of a model's zip, most specific first."""
     steps = re.fullmatch(r"(.+)_(\d+)_steps", path.stem)
     if steps:  # as Stable-Baselines3's CheckpointCallback names them
         yield path.with_name(f"{steps[1]}_vecnormalize_{steps[2]}_steps.pkl")
@@ -212,11 +206,7 @@ def load_sb3_policy(
 
 
 def _load_model(path: Path) -> BaseAlgorithm:
-    """Return the model in a zip, loaded with the class of its algorithm.
-
-    Raises:
-        ValueError: for an unknown algorithm.
-    """
+    """Return the model in a zip, loaded with the class of its algorithm."""
     data = load_from_zip_file(path, device="cpu")[0] or {}
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
     for algorithm, policy, stored in POLICY_CLASSES:

@@ -1,4 +1,4 @@
-"""Training with Stable-Baselines3 over the native vector environment, which can be stopped and resumed.
+"""Training with Stable-Baselines3 over the vector environment, which can be stopped and resumed.
 
 A checkpoint contains the model with its optimiser, the normalisation, the replay buffer if there is one, the
 environments in the middle of their episodes, and every random generator: a resumed run equals an uninterrupted one. It
@@ -81,7 +81,7 @@ def _step_eagerly(model: BaseAlgorithm) -> None:
 
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
-    """Write a model and its normalisation as ``model.zip`` and ``vecnormalize.pkl``."""
+    """Write a model as ``model.zip``, and its normalisation, if any, as ``vecnormalize.pkl``."""
     # Through memory: on a full disk torch raises its own exception.
     written = io.BytesIO()
     model.save(written)
@@ -101,7 +101,7 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
 
 
 def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
-    """Return an agent's network as plain arrays, several times as fast as the model.
+    """Return an agent's network as a fast :class:`.LearnedPolicy`; an agent that it cannot represent unchanged.
 
     An agent that a learned policy cannot represent is returned unchanged.
     """
@@ -114,7 +114,7 @@ def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPol
 def save_checkpoint(
     model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
 ) -> None:
-    """Write a checkpoint of model, environments and normalisation into a folder."""
+    """Write a checkpoint into a folder: model, environments, normalisation, and replay buffer if there is one."""
     save_model(model, normalisation, folder)
     if isinstance(model, OffPolicyAlgorithm):
         model.save_replay_buffer(folder / "replay_buffer.pkl")
@@ -134,11 +134,7 @@ def save_checkpoint(
 def load_checkpoint(
     run: TrainingRun, folder: Path, trust: bool
 ) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Return model, environments and normalisation of a checkpoint, to continue from.
-
-    Raises:
-        ValueError: if it is not trusted, or a file is missing or corrupt.
-    """
+    """Return model, environments and normalisation of a checkpoint, to continue from."""
     check_trust(f"the checkpoint in {folder} is loaded with pickle", trust)
     adapted = training_environment(run)
     env: Any = adapted
@@ -179,7 +175,7 @@ def check_algorithm(run: TrainingRun) -> None:
 
 
 def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Return the model of a new run, its environments, and their normalisation."""
+    """Return the model of a new run, its environments, and their normalisation (None: not normalised)."""
     # A deep copy: Stable-Baselines3 writes into policy_kwargs.
     values = copy.deepcopy(run.hyperparameters)
     for name in ("learning_rate", "clip_range"):
@@ -201,15 +197,10 @@ def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormali
 
 
 def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train with Stable-Baselines3 until ``run.steps`` environment steps, or Ctrl-C or SIGTERM; return the run.
+    """Train an agent with Stable-Baselines3 up to ``run.steps``, or Ctrl-C or SIGTERM; return the run.
 
-    Args:
-        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
-        session: settings of the session.
-
-    Raises:
-        ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
-            read.
+    An algorithm that does not fit the control, and a checkpoint that is corrupt or not trusted, raise
+    ValueError.
     """
     if session.resume and run.is_complete:
         return run

@@ -1,7 +1,7 @@
-"""A user's settings of a training run: those of the environment and of the algorithm, as options or in a file.
+"""A user's settings of a training run, as options or in a file: those of the environment and of the algorithm.
 
-Values are parsed as YAML. Later sources override earlier ones: the shipped file of hyperparameters, the user's file,
-single settings. Mappings are merged key by key.
+Values are parsed as YAML. Later sources override earlier ones, key by key: the shipped hyperparameters, the user's
+file, single settings.
 """
 
 import inspect
@@ -24,14 +24,14 @@ ESTIMATORS = ("kalman-net", "student")
 """Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", "bptt-strongest", "ma-ukf", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
-RIVALS = {"ma-ukf": "sigma-points", "rl-ukf": "unscented"}
-"""Algorithms of one control, of papers that train policies for it."""
+RIVALS = ("ma-ukf", "rl-ukf")
+"""Algorithms of one control, that of their hyperparameters: of papers that train policies for it."""
 RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run sets itself."""
 
 
 def convert_numbers(value: Any) -> Any:
-    """Return a parsed YAML value with numbers in scientific notation converted."""
+    """Return a parsed YAML value in which texts such as ``1e-3`` have become numbers."""
     if isinstance(value, str) and SCIENTIFIC.fullmatch(value):
         return float(value)
     if isinstance(value, list):
@@ -53,10 +53,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
-
-    Returns:
-        Keywords of the environment, and hyperparameters.
+    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``; further dots are keys inside a mapping.
 
     Raises:
         ValueError: for another form.
@@ -82,11 +79,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _read_table(path: Path, needs: str) -> dict[str, Any]:
-    """Return the mapping in a YAML file.
-
-    Raises:
-        ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
-    """
+    """Return the mapping in a YAML file."""
     try:
         table = convert_numbers(read_yaml(path))
     except (OSError, ValueError) as error:
@@ -98,11 +91,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
 
 
 def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
-    """Return the section of an environment in a table of settings, or the section ``default``.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Return an environment's section of a table of settings, else ``default``; raise ValueError without both."""
     section = table.get(id, table.get("default"))
     if section is None:
         raise ValueError(
@@ -118,9 +107,6 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
         path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with
             keywords of the environment in ``env_kwargs``; or with the keys ``env`` and ``algo``.
         id: environment id.
-
-    Returns:
-        Keywords of the environment, and hyperparameters.
 
     Raises:
         ValueError: if the file cannot be read, is of another form, or has no section for the environment.
@@ -149,13 +135,7 @@ def check_keywords(cls: type[Task], algorithm: str, keywords: Mapping[str, Any])
 
 
 def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
-    """Raise ValueError for a hyperparameter that the algorithm does not have.
-
-    Args:
-        algorithm: name of the algorithm.
-        values: hyperparameters to check.
-        shipped: hyperparameters of the shipped file.
-    """
+    """Raise ValueError for a hyperparameter that the algorithm does not have."""
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
         known |= {

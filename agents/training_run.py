@@ -1,8 +1,8 @@
 """Training runs of all algorithms: their options, their record and their folder.
 
-A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
-one, from which ``--resume`` continues, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
-validation cost) and the log.
+A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last one, with
+the ``run.json`` of its time, from which ``--resume`` continues), ``best/`` (the agent with the lowest validation cost)
+and the log.
 """
 
 import functools
@@ -95,7 +95,7 @@ class FirstWin(TypedDict):
 
 @dataclass
 class TrainingRun:
-    """The record of a training run, the content of ``run.json``."""
+    """Record of a training run: its settings, versions, progress and validations; the content of ``run.json``."""
 
     environment: str
     control: str
@@ -129,12 +129,12 @@ class TrainingRun:
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """Problem (task and baselines) of the environment."""
+        """Problem (task and baselines) of the run's environment."""
         return problem_of(self.environment)
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """Parameters of the task, without keywords of the training alone, such as the reward."""
+        """Task parameters of the run, without keywords of the training alone, such as the reward."""
         known = parameter_names(self.problem.task)
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
@@ -186,11 +186,7 @@ class RunOptions:
 
 
 def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
-    """Return a new run with options and hyperparameters merged.
-
-    Args:
-        problem: the problem of the training.
-        options: the user's options.
+    """Return the record of a new training run, from a user's options and the hyperparameters in files.
 
     Raises:
         ValueError: for an unknown name, a value out of its limits, a scenario that is held out, or an agent that cannot
@@ -237,11 +233,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
 
 
 def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyperparameters, and keywords of the environment from the user, merged from all sources.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
+    """Return a run's hyperparameters and the user's keywords of the environment, merged from all sources."""
     shipped = read_hyperparameters(problem.id, options.algorithm)
     keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
     keywords, values = merge_settings(keywords, options.keywords), merge_settings(values, options.overrides)
@@ -264,7 +256,7 @@ def _check_environment(
     parameters = {name: value for name, value in keywords.items() if name in known}
     models = [make_model(problem.task, control, name, **parameters) for name in scenarios]
     if options.residual_to or options.gated:
-        _check_around(options, models)
+        _check_residual_and_gate(options, models)
     for name, words in (("reward", REWARDS), ("dtype", DTYPES)):
         if name in keywords and keywords[name] not in words:
             raise nearest(name, keywords[name], words)
@@ -275,8 +267,8 @@ def _as_integer(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
-    """Raise ValueError if an agent cannot correct the requested policy, or act behind a gate."""
+def _check_residual_and_gate(options: RunOptions, models: Sequence[Model]) -> None:
+    """Raise ValueError if the agent of a run cannot correct its policy, or act behind its gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
     if len(models) > 1:
         raise ValueError(
@@ -300,14 +292,14 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     """Return the names of the controls that an algorithm can train, or the bank of a learned estimator.
 
     Raises:
-        ValueError: if the environment has no such filter.
+        ValueError: if the environment has no filter for the algorithm.
     """
-    if algorithm in RIVALS and RIVALS[algorithm] in cls.controls:
-        return (RIVALS[algorithm],)
     if algorithm not in ESTIMATORS and algorithm not in RIVALS:
         return cls.controls
+    own = read_hyperparameters(cls.id, algorithm)["env_kwargs"]["control"] if algorithm in RIVALS else None
+    if own in cls.controls:
+        return (own,)
     if algorithm not in trained_banks(cls):
-        own = RIVALS.get(algorithm)
         having = [c.id for c in catalogue().values() if algorithm in trained_banks(c) or own in c.controls]
         raise ValueError(
             f"{cls.id} has no filter for algorithm {algorithm!r}: choose another algorithm, or {', '.join(having)}"
@@ -333,7 +325,7 @@ def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
 
 
 def scenario_text(weights: Mapping[str, float]) -> str:
-    """Return a scenario or a mixture as text, such as ``random:0.8,paper:0.2``."""
+    """Return weights of scenarios as text, such as ``random:0.8,paper:0.2``; of one scenario its name alone."""
     if len(weights) == 1:
         return next(iter(weights))
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
@@ -375,12 +367,7 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
 
 
 def check_trust(what: str, trust: bool) -> None:
-    """Raise ValueError if a file or module that can execute code is not trusted.
-
-    Args:
-        what: the file or module, and how it is loaded.
-        trust: whether the user trusts it.
-    """
+    """Raise ValueError if a file or module that can execute code is not trusted."""
     if not trust:
         raise ValueError(
             f"{what}, which can execute code: if you made it or know who did, add --trust (in Python: trust=True)"
@@ -388,7 +375,7 @@ def check_trust(what: str, trust: bool) -> None:
 
 
 def save_run(run: TrainingRun, path: Path) -> None:
-    """Write a run's record to a file in one atomic step."""
+    """Write a training run's record to a file, whole or not at all."""
     write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
@@ -435,7 +422,7 @@ def best_agent(folder: Path) -> Path:
 
 
 def resume_run(folder: Path, requested: TrainingRun, same: bool = False) -> TrainingRun:
-    """Return the run of a folder, to continue it to the requested steps; repair folders that a crash left.
+    """Return the run of a folder, to be continued to the requested steps; repair folders that a crash left.
 
     Args:
         folder: folder of the run.
@@ -494,13 +481,9 @@ def has_run(folder: Path) -> bool:
 
 
 def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
-    """Begin a run in a folder or continue the one there, store its command and versions, and return it.
+    """Begin a run in a folder or continue the one there, and return its record with command and versions.
 
-    Args:
-        folder: folder of the run.
-        requested: the run that the user describes.
-        resume: continue the run of the folder.
-        same: keep the run's own hyperparameters, see :func:`resume_run`.
+    Arguments are those of :func:`resume_run`; ``resume`` continues the run of the folder.
 
     Raises:
         ValueError: if the folder cannot be written to, or contains a run that is not to be resumed or a different one.

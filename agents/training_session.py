@@ -17,7 +17,7 @@ from .validation import Validation
 
 
 def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Return the numbers of a validation for the log, by name."""
+    """Return the numbers of a validation for the training log, by name."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]
@@ -28,9 +28,7 @@ def _curve(entry: ValidationEntry) -> dict[str, float]:
 def make_logger(folder: Path, steps_done: int) -> Any:
     """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
 
-    Args:
-        folder: folder of the files.
-        steps_done: environment steps before this session; a resumed run writes its own files.
+    A resumed run writes its own files, named after ``steps_done``.
     """
     from stable_baselines3.common.logger import Logger, make_output_format
 
@@ -56,7 +54,7 @@ def curve_writer(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C or SIGTERM has requested a stop; the second stops at once."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM came; a second signal acts at once."""
     wished = False
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
         yield lambda: False
@@ -121,7 +119,7 @@ class Session:
 
 
 class Trainee(NamedTuple):
-    """An agent in training: its policy, and functions that save it."""
+    """An agent in training: its policy, and functions that save a checkpoint and the agent."""
 
     policy: Any
     """Policy of the agent, for an evaluation."""
@@ -132,15 +130,10 @@ class Trainee(NamedTuple):
 
 
 class Bookkeeping:
-    """Bookkeeping of a run in training: validations, checkpoints, and the record.
+    """Validations, checkpoints and record of a run in training.
 
-    Args:
-        run: the record, which is updated.
-        session: settings of the session; every validation is followed by a checkpoint.
-        trainee: the agent.
-        stop: function that returns whether a stop was requested.
-        log: function that writes numbers by name at a number of environment steps.
-        began: ``time.monotonic`` before the environments were made, in s.
+    ``stop`` returns whether a stop was requested; ``began`` is ``time.monotonic`` before the environments
+    were made.
     """
 
     def __init__(
@@ -167,7 +160,7 @@ class Bookkeeping:
         self.seconds_before: float = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:
-        """Validate and save between two updates if it is time, and return whether to stop."""
+        """Validate and write a checkpoint if it is time, between two updates; return whether to stop."""
         stopping = self.stop()
         if not (stopping or last or steps_done >= self.due):
             return False

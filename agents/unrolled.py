@@ -2,7 +2,7 @@
 
 On small arrays automatic differentiation spends nearly all its time on its own tape. Here the part of the episodes
 is compiled (:class:`~..envs.rollout.Rollout`), and that of the policy is the chain rule by hand. The gradients equal
-those of torch.
+torch's.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,10 +29,7 @@ LIMIT = 10.0
 class UnrolledPolicy:
     """Forward and backward pass of a :class:`~.bptt.NetworkPolicy` over N episodes.
 
-    Args:
-        policy: the policy whose parameters are used, and to whose gradients are added.
-        envs: number of episodes.
-        decisions: largest number of decisions between two backward passes.
+    ``decisions`` is the largest number of decisions between two backward passes.
     """
 
     def __init__(self, policy: Any, envs: int, decisions: int) -> None:
@@ -48,7 +45,7 @@ class UnrolledPolicy:
         self._seen[0, self._fields : -1] = 0.0
 
     def read(self) -> None:
-        """Copy the current parameters from torch to the NumPy arrays."""
+        """Copy the current parameters of the policy from torch to the NumPy arrays."""
         policy = self._policy
         self._mean, self._scale, self._used, self._low, high = (
             part.numpy()[:, None]
@@ -95,13 +92,7 @@ class UnrolledPolicy:
 
 
 class UnrolledLayers:
-    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them.
-
-    Args:
-        layers: linear layers of torch.
-        envs: number of episodes.
-        decisions: largest number of decisions between two backward passes.
-    """
+    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them."""
 
     def __init__(self, layers: Sequence[Any], envs: int, decisions: int) -> None:
         self._layers = layers
@@ -111,7 +102,7 @@ class UnrolledLayers:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Copy the current parameters from torch to the NumPy arrays."""
+        """Copy the current weights and biases from torch to the NumPy arrays, and clear the gradients."""
         pairs = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in self._layers]
         self._matrices = [numpy.concatenate([weight, bias[:, None]], axis=1) for weight, bias in pairs]
         self._of_matrices = [numpy.zeros_like(matrix) for matrix in self._matrices]
@@ -142,7 +133,7 @@ class UnrolledLayers:
         return gradient
 
     def add_gradients(self) -> None:
-        """Add the window's gradients to those of torch's parameters."""
+        """Add the window's gradients to those of the layers' torch parameters."""
         for layer, of_matrix in zip(self._layers, self._of_matrices, strict=True):
             _add_gradient(layer.weight, of_matrix[:, :-1])
             _add_gradient(layer.bias, of_matrix[:, -1])
@@ -178,7 +169,7 @@ class UnrolledMemory:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Copy the current parameters from torch to the NumPy arrays."""
+        """Copy the current parameters of the GRU from torch to the NumPy arrays, and clear the gradients."""
         fields, size = self._fields, self._size
         input, memory, input_bias, memory_bias = (part.detach().numpy() for part in self._gru.parameters())
         self._matrix = matrix = numpy.zeros((4 * size, fields + size + 1), input.dtype)
@@ -242,7 +233,7 @@ class UnrolledMemory:
         return of_seen[:fields]
 
     def add_gradients(self) -> None:
-        """Add the window's gradients to those of torch's parameters."""
+        """Add the window's gradients to those of the GRU's torch parameters."""
         fields, size, of_matrix = self._fields, self._size, self._of_matrix
         both = numpy.r_[: 2 * size, 3 * size : 4 * size]
         gradients = (
@@ -284,11 +275,7 @@ class Teacher:
         self._lanes = Lanes(model, env.num_envs, report=_estimate)
 
     def estimates(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)`` of episodes.
-
-        Args:
-            identities: identities of the episodes, ``(2, width)``.
-        """
+        """Return the teacher's means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)``."""
         self._lanes.begin(identities[:, : self._lanes.count])
         found: tuple[numpy.ndarray, numpy.ndarray] = self._lanes.run(_estimate)[0]
         return found
@@ -302,7 +289,7 @@ COST = TrainingObjective("cost")
 
 
 class Unrolled:
-    """Simulation and differentiation of N compiled episodes under a policy, in windows of decisions.
+    """Simulation of N compiled episodes under a policy, and its gradients, in windows of decisions.
 
     Args:
         env: environments with compiled backend, continuous actions and autoreset mode "Disabled"; they give the
@@ -410,7 +397,7 @@ class Unrolled:
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
             rollout.shown_adjoint[self._means.columns] /= interval
         policy.add_gradients(decisions)
-        rollout.go_on()
+        rollout.drop_stored()
         return -reward * share
 
     def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:

@@ -29,11 +29,6 @@ class TrainingEpisodes:
 
     All episodes are simulated in every scenario of a mixture, and the results are weighted as in the mixture: the same
     expectation with less variance than random scenarios.
-
-    Args:
-        run: the run with environment, scenario, and parameters of the task.
-        episodes: number of episodes.
-        backend: backend of the steps.
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
@@ -45,7 +40,7 @@ class TrainingEpisodes:
         self._models: dict[tuple[str | None, str, str], Model] = {}
 
     def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
-        """Return the model of a control and scenario from a cache, as compilation takes time."""
+        """Return the model of a control and scenario, cached since compilation takes time."""
         key = control, scenario, repr(keywords)
         if key not in self._models:
             cls, parameters = self.problem.task, {**keywords, **self.keywords}
@@ -89,11 +84,7 @@ def validation_backend(run: TrainingRun) -> str:
 
 
 class Validation:
-    """Scores of an agent and of the paper's algorithm, if any, on the same episodes of the validation split.
-
-    Args:
-        run: the run of the agent.
-    """
+    """Scores of an agent and of the paper's algorithm, if any, on the same episodes of the validation split."""
 
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
@@ -105,7 +96,7 @@ class Validation:
         self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
-        """Return the mean cost over the episodes, then over each bootstrap resample, ``(1 + resamples,)``."""
+        """Return a policy's mean cost over all episodes, then over each bootstrap resample, ``(1 + resamples,)``."""
         return self.bootstrap.means(self.episodes.costs(policy, control))
 
     def score(self, policy: Any) -> ValidationEntry:

@@ -1,14 +1,12 @@
 """Choice of the best filter for a recording, with its fitted parameters and its gain over the shipped filters.
 
-The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
-chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
-19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. Its rival is
-chosen on the same measurements among the shipped filters, which are not fitted: the paper's algorithm, unless another
-is likelier beyond chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its
-gain over the rival is beyond chance, or where it is as good and cheaper. The last quarter serves the judgement: where
-the fitted one errs more there, beyond chance, the likelihood misleads, and the rival is advised. The filter that is
-best there in hindsight is reported separately: the best of many looks better than it is. Intervals come from whole
-stretches of measurements, since neighbours are not independent.
+The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One
+is chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike,
+IEEE Trans. AC 19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all
+three quarters. Its rival among the shipped filters is the paper's algorithm, unless another is likelier
+beyond chance; then it is the cheapest that is as good as the likeliest. The fitted one is advised where its
+gain over the rival is beyond chance, or where it is as good and cheaper, unless it errs more, beyond chance,
+on the last quarter. The best filter there in hindsight is reported separately.
 """
 
 import dataclasses
@@ -92,7 +90,7 @@ class FittedLog:
 
     @cached_property
     def task(self) -> Task:
-        """Task with the parameters of the recording, without its data."""
+        """Task with the parameters of the recording, but without its measurements."""
         scenario = self.recording.scenario(self.problem.task, self.keywords)
         scenario = dataclasses.replace(scenario, recording=None)
         return make_task(self.problem.task, scenario, **{**self.keywords, "horizon": 1})
@@ -108,11 +106,11 @@ class FittedLog:
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
     def with_noise(self, family: Tunable, is_own: bool = False, robust: bool = False) -> Tunable:
-        """Return a family with the scale of the measurement noise as one more parameter, if ``noise`` is set.
+        """Return a filter family with the measurement noise's scale, and with ``robust`` outliers, as more
+        parameters.
 
-        A family with a second sensor is returned unchanged: measurements ``APART`` contain little information on the
-        scale. With ``robust`` the share of outliers is added, except to a user's family (``is_own``), whose records
-        may be incomplete.
+        A family with a second sensor is returned unchanged; the scale is added if ``noise`` is set, the share
+        of outliers not to a user's family (``is_own``).
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:
@@ -123,7 +121,9 @@ class FittedLog:
 
     @cached_property
     def stretches(self) -> list[Span] | None:
-        """Beginnings of the blocks for the fit, ``COARSE`` measurements in all; None for a short recording."""
+        """Beginnings of the blocks for the fit, with ``COARSE`` measurements in all; None for a short
+        recording.
+        """
         total = sum(span.last - span.first for span in self.share.fitted)
         if total < 2 * COARSE:
             return None
@@ -134,11 +134,13 @@ class FittedLog:
 
     @cached_property
     def _cut(self) -> dict[Any, Windows]:
-        """Windows of the recording cut so far, by their spans; all filters use them."""
+        """Cache of the windows cut from the recording, by their spans."""
         return {}
 
     def windows(self, spans: Sequence[Span], anchored: bool = False) -> Windows:
-        """Return spans of the recording cut into windows, with measurements ``APART`` for ``anchored`` filters."""
+        """Cut spans of the recording into windows; for ``anchored`` filters with measurements ``APART`` seconds
+        apart.
+        """
         every, warm_up = 1, self.share.warm_up
         if anchored:
             warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
@@ -151,16 +153,13 @@ class FittedLog:
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
         """Return the likelihood function of a filter family's parameters on spans of the recording.
 
-        For an anchored family, or with ``thinned``, it uses measurements that are ``APART``.
+        For an anchored family, or with ``thinned``, its measurements are ``APART`` seconds apart.
         """
         windows = self.windows(spans, tunable.anchored or thinned)
         return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)
 
     def fit(self, tunable: Tunable) -> tuple[Fit, WindowLikelihood]:
-        """Fit a family to the blocks for the fit; return the fit, and the likelihood function.
-
-        For a long recording the search uses :attr:`stretches` alone.
-        """
+        """Fit a family to the blocks for the fit; return the fit and the likelihood function."""
         if self.stretches is None or tunable.anchored:
             likelihood = self.likelihood(self.share.fitted, tunable)
             return fit(likelihood, tunable, self.seed), likelihood
@@ -170,7 +169,7 @@ class FittedLog:
 
 
 class Fits(NamedTuple):
-    """Families of filters fitted to a log, by name: fits, tunables and likelihoods."""
+    """Families of filters fitted to a recording, by name: fits, tunable values and likelihood functions."""
 
     found: dict[str, Fit]
     tunables: dict[str, Tunable]
@@ -182,7 +181,7 @@ class Fits(NamedTuple):
         return [name for name, tunable in self.tunables.items() if tunable.anchored]
 
     def make(self, name: str) -> Any:
-        """Return the maker of a fitted filter, by its name."""
+        """Return the maker of a fitted filter."""
         return make_tuned_policy(f"fitted {name}", self.tunables[name], self.found[name].values)
 
 
@@ -198,12 +197,7 @@ class Anchor(NamedTuple):
 
 
 class Prices(Mapping[str, Mapping[str, int] | None]):
-    """Costs of an update of each competitor, computed at first use; None where the cost is unknown.
-
-    Args:
-        makers: competitors by name.
-        price_of: function from name and maker to the costs of an update: ``operations`` and further measures.
-    """
+    """Costs of an update of each competitor, by name, computed at first use; None where the cost is unknown."""
 
     def __init__(
         self, makers: Mapping[str, Any], price_of: Callable[[str, Any], Mapping[str, int] | None]
@@ -224,7 +218,7 @@ class Prices(Mapping[str, Mapping[str, int] | None]):
         return len(self.makers)
 
     def operations(self, name: str) -> float:
-        """Return the operations of an update of a competitor; infinite where they are unknown."""
+        """Return the arithmetic operations of a competitor's update; infinite where they are unknown."""
         price = self[name]
         return math.inf if price is None else float(price["operations"])
 
@@ -276,7 +270,7 @@ class Advice(NamedTuple):
 
     @property
     def advised(self) -> JudgedFilter:
-        """Return the advised filter, the first of the competitors."""
+        """Advised filter, the first of the competitors."""
         return self.competitors[0]
 
 
@@ -293,10 +287,10 @@ def advise(
         log: the recording, with the options of the fits.
         shipped: competitors that are not fitted, by name.
         user_families: further families, such as a user's estimator with limits of its parameters.
-        progress: function that is called with a description of the work done, or an empty text, and the share of all
+        progress: function called with a description of the work done, or empty text, and the share of all
             work.
-        price_of: function from a competitor's name and maker to the costs of an update: ``operations`` and further
-            measures; None where they are unknown, which ranks it as the most expensive.
+        price_of: function from a competitor's name and maker to the costs of an update, such as
+            ``operations``; None where they are unknown, which ranks it as the most expensive.
 
     Raises:
         ValueError: if no family can be fitted, or the recording is too short.
@@ -369,10 +363,7 @@ def advise(
 
 
 def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable[[str, float], None]) -> Fits:
-    """Fit every family, the user's own too, to the blocks for the fit, and return the fits.
-
-    Each is fitted without and then with outliers; the latter fit is used where it is likelier.
-    """
+    """Fit every family of filters, without and then with outliers; keep the likelier fit of each."""
     families = {**families_of(log.problem, log.recording), **own}
     if int(log.recording.rows.sum()) * log.interval < FEWEST * APART:  # too few measurements ``APART``
         families = {name: family for name, family in families.items() if not family.anchored}
@@ -397,7 +388,7 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
 
 
 def _fit_finalists(log: FittedLog, fits: Fits) -> None:
-    """Replace the fits of families near the best by fits to all blocks, started at the values from stretches."""
+    """Improve the fits of families near the best by fits to all blocks, started at the values from stretches."""
     means = {name: found.log_likelihood / found.measurements for name, found in fits.found.items()}
     known = {name: mean for name, mean in means.items() if name not in fits.anchored}
     for name, mean in known.items():
@@ -413,7 +404,7 @@ def _fit_finalists(log: FittedLog, fits: Fits) -> None:
 def _choose(
     log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[JudgedFilter]
 ) -> tuple[JudgedFilter, Anchor | None]:
-    """Return the chosen fitted filter, and the comparison with the one that uses a second sensor, or None."""
+    """Return the chosen fitted filter, and its comparison with the one that uses a second sensor, or None."""
     anchored, anchor = fits.anchored, None
     chosen = judgement.simplest([c for c in competitors if c.fitted and c.name not in anchored])
     for name in anchored:
@@ -438,7 +429,7 @@ def _fit_again(
 
 
 def _first_verdict(fits: Fits, shipped: int) -> str:
-    """Return a sentence on the family of the highest penalised likelihood on the measurements of the fit."""
+    """Return a sentence on the fitted family of highest penalised likelihood."""
     known = {
         name: (found.log_likelihood - len(found.values)) / found.measurements
         for name, found in fits.found.items()
@@ -456,11 +447,7 @@ def _first_verdict(fits: Fits, shipped: int) -> str:
 
 
 def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, Interval]]:
-    """Fit one filter to all of a recording; return the family, the fit, and intervals of the parameters.
-
-    Returns:
-        The family with the scale of the noise, the fit, and the intervals of the parameters by name.
-    """
+    """Fit one filter to all of a recording; return family, fit, and the intervals of the parameters by name."""
     share, rows = log.share, log.recording.rows
     spans = [Span(i, min(share.warm_up, int(each) - 1), int(each)) for i, each in enumerate(rows)]
     if share.apart:  # side by side it takes a fraction of the time
@@ -480,7 +467,7 @@ def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, In
 
 
 def find_outliers(task: Task, recording: Recording, tunable: Tunable, result: Fit) -> numpy.ndarray:
-    """Return a boolean mask ``(E, T)`` of the measurements that a fitted filter treats as outliers."""
+    """Run a fitted filter over a recording; return a mask ``(E, T)`` of measurements treated as outliers."""
     is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
     if OUTLIER_SHARE not in result.values:
         return is_outlier
@@ -502,12 +489,10 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, result: Fi
 
 
 def _compare_anchored(log: FittedLog, tunables: Mapping[str, Tunable], fitted: Fit) -> Anchor:
-    """Return the gain of a filter with a second sensor over another one, on measurements ``APART`` seconds apart.
+    """Compare a filter with a second sensor to another one by likelihood, on measurements ``APART`` seconds
+    apart.
 
-    It is the first of the two ``tunables``, and ``fitted`` is its fit; the other one is fitted here.
-
-    This likelihood is comparable: it is of the same measurements, given the same earlier ones. From one measurement to
-    the next the other filter follows errors that last, and so predicts them well.
+    It is the first of the two ``tunables``, with the fit ``fitted``; the other one is fitted here.
     """
     (name, anchored), (other, best) = tunables.items()
     rival = fit(log.likelihood(log.share.fitted, best, thinned=True), best, log.seed)

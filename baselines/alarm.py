@@ -5,9 +5,8 @@ long as the sum is positive (Page's cumulative sum, 1954); the alarm sounds wher
 fault a sum with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so the limit follows from the
 tolerated number of false alarms.
 
-Signs of a fault are innovations that are larger than a filter expects, smaller, or to one side, and a reading that
-repeats itself. A missing measurement counts as a sign where the filter does not model it, as with fixed gains; a Kalman
-filter only predicts then.
+Signs of a fault are innovations that are larger than expected, smaller, or to one side, and a reading that
+repeats itself. A missing measurement counts where the filter does not model it, as with fixed gains.
 
 An environment names its alarm in ``Baselines.alarm``; the default is :class:`InnovationAlarm`.
 """
@@ -31,7 +30,7 @@ CERTAIN = math.inf
 
 
 def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
-    """Return the log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
+    """Return the log-likelihood ratio of ``factor`` times the expected variance to the expected one.
 
     Args:
         squares: normalised innovation squared, chi-square without a fault.
@@ -47,11 +46,8 @@ def shift_ratio(normalised: Any, mean: float) -> Any:
 
 
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Return the log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
-
-    Args:
-        normalised: innovations over their predicted deviation, ``(N, C)``.
-        there: whether each innovation exists; the value of a missing one is ignored.
+    """Return log-likelihood ratios of too large, too small and shifted innovations to expected ones,
+    ``(N, 4 C)``.
     """
     ratios = [scale_ratio(normalised**2, 1.0, factor) for factor in (LARGER, SMALLER)]
     ratios += [shift_ratio(normalised, mean) for mean in (SHIFT, -SHIFT)]
@@ -59,7 +55,7 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
 
 
 def fault_evidence(wrong: numpy.ndarray) -> numpy.ndarray:
-    """Return the log-likelihood ratio ``(N, 1)``: ``CERTAIN`` where ``wrong`` ``(N,)`` is true, else zero."""
+    """Return ``CERTAIN`` as log-likelihood ratio where ``wrong`` ``(N,)`` is true, else zero, ``(N, 1)``."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
 
@@ -73,11 +69,7 @@ class Sums(NamedTuple):
 
 
 class Alarm:
-    """Base of the alarms: subclasses compute the evidence of a fault.
-
-    Args:
-        model: model whose observations it receives.
-    """
+    """Base of the alarms, by cumulative sums; subclasses compute the evidence of each kind of fault."""
 
     window: ClassVar[int] = 30
     """Decisions for which an alarm remains relevant: the memory of the disturbed filters."""
@@ -90,35 +82,22 @@ class Alarm:
         self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of measurements since the last observation, ``(N, 1)``; one at the start.
-
-        Args:
-            before: the last observation, ``(N, fields)``; NaN where an episode begins.
+        """Return the number of measurements since the last observation ``before``, ``(N, 1)``; one at the
+        start.
         """
         return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Return the log-likelihood ratio of each kind of fault to no fault, ``(N, kinds)``.
 
-        Args:
-            observation: ``(N, fields)``.
-            before: the last observation; NaN where an episode begins.
+        ``before`` is the last observation; NaN where an episode begins.
         """
         raise NotImplementedError
 
     def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
-        """Update the cumulative sums with an observation; return which lanes have a fault, and the memory.
-
-        Args:
-            observation: ``(N, fields)``.
-            memory: memory that the last call returned; None at the first.
-            start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Whether there is a fault, booleans ``(N,)``, and memory.
-        """
+        """Update the cumulative sums; return a mask ``(N,)`` of episodes with a fault, and the memory."""
         before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))
         sums = numpy.zeros_like(evidence) if memory is None else memory.sums

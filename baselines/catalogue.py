@@ -20,7 +20,7 @@ USER_BASELINES: dict[str, Baselines] = {}
 
 @cache
 def package_of(id: str) -> ModuleType | None:
-    """Return the Python package with the baselines of a Gymnasium id; None if this package has none."""
+    """Return the Python package with the shipped baselines of a Gymnasium id; None if there is none."""
     folder = folders().get(id)
     if folder is None or importlib.util.find_spec(f"{__package__}.{folder}") is None:
         return None
@@ -30,7 +30,7 @@ def package_of(id: str) -> ModuleType | None:
 def baselines_of(id: str) -> Baselines:
     """Return the baselines of the environment of a Gymnasium id.
 
-    Without registered ones: the paper's algorithm that its class declares, and random actions.
+    By default these are the paper's algorithm that its task declares, and random actions.
     """
     package = package_of(id)
     if package is not None:
@@ -40,7 +40,7 @@ def baselines_of(id: str) -> Baselines:
 
 @cache
 def _declared_baselines(task: type[Task]) -> Baselines:
-    """Return the baselines of a task that registered none: the paper's algorithm that it declares, random actions."""
+    """Return the default baselines of a task: the paper's algorithm that it declares, and random actions."""
     if not isinstance(task.paper_policy.action, tuple):
         return Baselines(task.id, {"random": RandomPolicy})
     paper = type("DeclaredPaper", (PaperAction,), {"control": task.paper_policy.control})
@@ -48,11 +48,7 @@ def _declared_baselines(task: type[Task]) -> Baselines:
 
 
 def add_baselines(task: type[Task], table: Baselines) -> None:
-    """Register the baselines of a user's environment.
-
-    Args:
-        task: class of the environment's task.
-        table: its baselines.
+    """Register the baselines of a user's environment, after a check of their names.
 
     Raises:
         ValueError: if the table refers to an unknown name.

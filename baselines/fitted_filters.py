@@ -28,12 +28,7 @@ MOST_MEASUREMENTS = 100_000
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
-    """Return the filter families of an environment that can be fitted to a recording, by name.
-
-    Args:
-        problem: problem of the filters.
-        recording: recording that sets the limits of the parameters; None: those of a typical recording.
-    """
+    """Return the filter families of an environment that can be fitted to a recording, by name."""
     known = problem.baselines
     if known.log_families is not None:
         return dict(known.log_families(recording))
@@ -67,7 +62,7 @@ def own_family(name: str, cls: Any) -> Tunable:
 
 
 class Artefact(NamedTuple):
-    """Content of an advised filter's file."""
+    """Content of an advised filter's file: name of the family, maker of the filter, and options for its log."""
 
     filter: str
     """Name of the family, or of the shipped filter."""
@@ -78,7 +73,7 @@ class Artefact(NamedTuple):
 
 
 def log_setup(problem: Problem, recording: Any) -> LogSetup:
-    """Return the options with which a recording was read, to read such a log again."""
+    """Return the options with which a recording was read, so that such a log can be read again."""
     parameters = recording.scenario(problem.task, {}).parameters
     left_out = "horizon", "decision_interval"
     deviations, source = dict(recording.deviations), recording.deviations_from
@@ -160,11 +155,7 @@ def write_advised(
 
 
 def read_artefact(path: Path, problem: Problem) -> Artefact:
-    """Return the content of an advised filter's file.
-
-    Args:
-        path: path of a file of :func:`write_advised`.
-        problem: problem in which it is to run.
+    """Read the file of an advised filter.
 
     Raises:
         ValueError: if the file cannot be read, or is of another environment or no filter of it.
@@ -186,7 +177,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
 
 
 def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
-    """Return the validated options for reading the log from a file's entry; None without one."""
+    """Validate the log options in a file's entry; None without an entry."""
     if log is None:
         return None
     kinds = {
@@ -216,7 +207,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
         or not 0 <= log["horizon"] <= MOST_MEASUREMENTS
-        or not (not log["origin"] or _is_place(log["origin"]))
+        or not (not log["origin"] or _is_valid_origin(log["origin"]))
     ):
         raise ValueError(f"{path}: its entry on the log is invalid: write it again with filtergym advise")
     try:
@@ -226,8 +217,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     return LogSetup(**{key: log[key] for key in kinds})
 
 
-def _is_place(origin: Mapping[str, float]) -> bool:
-    """Return whether an origin has a valid latitude and longitude, and a height near the Earth."""
+def _is_valid_origin(origin: Mapping[str, float]) -> bool:
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 

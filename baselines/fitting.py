@@ -1,10 +1,9 @@
 """Maximum-likelihood fits of the parameters of a filter to a recording.
 
-The likelihood of a filter's one-step predictions is that of the recording under its model (Schweppe, IEEE Trans. IT 11,
-1965). It is maximised by L-BFGS-B within the limits of the parameters from several starts. The intervals are profile
-likelihood's: a value lies inside where the likelihood, the other parameters adapted, is at most half the chi-square
-quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988). Where a profile finds a point of
-higher likelihood, the fit starts again from there.
+The likelihood of a filter's one-step predictions is that of the recording under its model (Schweppe, IEEE
+Trans. IT 11, 1965). It is maximised by L-BFGS-B within the limits of the parameters from several starts. The
+intervals are profile likelihood's: a value lies inside where the likelihood, the other parameters adapted, is
+at most half the chi-square quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988).
 
 Measurements may come from a mixture: most have the stated deviations, a fitted share has ``WIDE`` times as large ones
 (Huber, Annals of Mathematical Statistics 35, 1964). The filter computes both updates and uses the likelier one.
@@ -78,7 +77,7 @@ class Profile(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A filter fitted to a recording."""
+    """Fitted parameters of a filter, with the log-likelihood of the recording."""
 
     values: dict[str, float]
     """Values of the parameters in the units of the search."""
@@ -93,13 +92,7 @@ class Fit(NamedTuple):
 
 
 class ScaledNoise(Filter[Task, Any, Any]):
-    """A filter run with the stated deviations of measurements multiplied by a factor; its state is the inner filter's.
-
-    Args:
-        own: the filter.
-        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
-        factor: a number, or ``(N,)``.
-    """
+    """A filter run with scaled deviations of measurements; its state is the inner filter's."""
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], factor: Any) -> None:
         super().__init__(own.task)
@@ -109,32 +102,32 @@ class ScaledNoise(Filter[Task, Any, Any]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> Any:
-        """Return the inner filter's state at the initial estimate, with its covariance times the factor's square."""
+        """Start the inner filter, with the initial covariance times the factor's square; return its state."""
         return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2))
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Return the inner filter's state predicted to the scaled measurement."""
+        """Predict the inner filter to the scaled measurement; return its state."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
     def update(self, state: Any, inputs: FilterInput) -> Any:
-        """Return the inner filter's state after an update with the scaled measurement."""
+        """Update the inner filter with the scaled measurement; return its state."""
         return self.own.update(state, FilterInput(self.scaled(inputs.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
-        """Return the mean of the inner filter's estimate, ``(C, N)``."""
+        """Return the mean of the inner filter, ``(C, N)``."""
         return self.own.mean(state)
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the inner filter's estimate, ``(C, C, N)``."""
+        """Return the covariance of the inner filter, ``(C, C, N)``."""
         return self.own.covariance(state)
 
     def records(self, state: Any, measurement: Any) -> dict[str, Array]:
-        """Return the inner filter's records of the scaled measurement, by name."""
+        """Return the inner filter's statistics of the scaled measurement, by name."""
         return self.own.records(state, self.scaled(measurement, self.factor))
 
 
 def with_noise_scale(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
-    """Return a tunable estimator with the decimal logarithm of the measurement noise's scale as one more parameter.
+    """Return a tunable estimator with log10 of the measurement noise's scale as one more parameter.
 
     Args:
         tunable: an estimator.
@@ -154,7 +147,7 @@ def with_noise_scale(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tuna
 
 
 class RobustState(NamedTuple):
-    """State of a filter that models outliers."""
+    """State of a filter that models outliers, with the likelihood of the mixture."""
 
     own: Any
     """State of the inner filter."""
@@ -163,13 +156,7 @@ class RobustState(NamedTuple):
 
 
 class RobustEstimator(Filter[Task, Any, RobustState]):
-    """A filter that treats every measurement either as stated or as an outlier, whichever is likelier.
-
-    Args:
-        own: the filter, which reports the log-likelihood.
-        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
-        share: share of outliers, a number, or ``(N,)``.
-    """
+    """A filter that treats every measurement either as stated or as an outlier, whichever is likelier."""
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], share: Any) -> None:
         super().__init__(own.task)
@@ -179,18 +166,22 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> RobustState:
-        """Return the inner filter's state at the initial estimate, with unknown likelihood."""
+        """Start the inner filter; return the state with unknown likelihood."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: RobustState, inputs: FilterInput) -> RobustState:
-        """Return the likelier of two updates, with stated and with wide deviations, and the mixture's likelihood."""
+        """Update with stated or wide deviations, whichever is likelier; return the state with the mixture's
+        likelihood.
+        """
         (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(inputs.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
         return RobustState(select_nested(is_outlier, wide, usual), likelihood)
 
     def compare(self, measurement: Any, state: Any) -> tuple[Any, Any, Any, Any]:
-        """Return both updates, whether the second one is likelier, and the mixture's log-likelihood, ``(N,)`` each."""
+        """Return both updates, a mask of where the second one is likelier, and the mixture's log-likelihood
+        ``(N,)``.
+        """
         xp = self.xp
         usual, wide = (self._step(state, z) for z in (measurement, self.scaled(measurement, WIDE)))
         one = usual[1].log_likelihood + xp.log(1.0 - self.share)
@@ -205,18 +196,17 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return after, Likelihood.of_records(self.own.records(after, measurement))
 
     def mean(self, state: RobustState) -> Array:
-        """Return the mean of the inner filter's estimate, ``(C, N)``."""
+        """Return the mean of the inner filter, ``(C, N)``."""
         return self.own.mean(state.own)
 
     def covariance(self, state: RobustState) -> Array:
-        """Return the covariance of the inner filter's estimate, ``(C, C, N)``."""
+        """Return the covariance of the inner filter, ``(C, C, N)``."""
         return self.own.covariance(state.own)
 
 
 def with_outliers(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
-    """Return a tunable estimator with the share of outliers as one more parameter.
-
-    Arguments are those of :func:`with_noise_scale`.
+    """Return a tunable estimator with the share of outliers as one more parameter; see
+    :func:`with_noise_scale`.
     """
     low, start, high = SHARE_LIMITS
 
@@ -233,14 +223,7 @@ def with_outliers(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable
 
 
 def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: int = STARTS) -> Fit:
-    """Fit the parameters of an estimator by maximum likelihood, from several starts, and return the fit.
-
-    Args:
-        likelihood: likelihood of the tunable's parameters.
-        tunable: the estimator, with limits.
-        seed: seed of the starts.
-        starts: number of starts.
-    """
+    """Fit the parameters of an estimator by maximum likelihood, the best of several starts."""
     ends = _find_maxima(likelihood, tunable, seed, starts)
     values = [-likelihood.count * float(end.fun) for end in ends]
     best = int(numpy.argmax(values))
@@ -250,15 +233,8 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
 def fit_stretches(
     likelihood: WindowLikelihood, tunable: Tunable, whole: WindowLikelihood, seed: int = 0
 ) -> Fit:
-    """Fit parameters to stretches of a long recording; return the end that is likeliest on the whole recording.
-
-    It need not be a maximum there.
-
-    Args:
-        likelihood: likelihood of the stretches.
-        tunable: the estimator, with limits.
-        whole: the likelihood of the whole.
-        seed: seed of the starts.
+    """Fit parameters to stretches of a long recording; return the search's end that is likeliest on the
+    whole.
     """
     ends = _find_maxima(likelihood, tunable, seed, STARTS)
     values = whole(numpy.array([end.x for end in ends]).T).tolist()
@@ -270,7 +246,9 @@ def fit_stretches(
 
 
 def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
-    """Return the fit to ``count`` measurements at ``best``, with maximum and spread of ``values`` of all searches."""
+    """Make the :class:`Fit` at the parameters ``best``; ``values`` are the log-likelihoods that all searches
+    found.
+    """
     low, high = numpy.array(list(tunable.limits.values())).T
     edge = 1e-3 * (high - low)
     at_limit = tuple(
@@ -283,7 +261,7 @@ def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[
 
 
 def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, starts: int) -> list[Any]:
-    """Return SciPy's results of searches from several starts, which minimise nats per measurement."""
+    """Search maxima of the likelihood from several starts; return SciPy's results, in nats per measurement."""
     from scipy.optimize import minimize
 
     limits = list(tunable.limits.values())
@@ -326,7 +304,7 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
     return H
 
 
-class _Way(NamedTuple):
+class _ProfileSide(NamedTuple):
     """One side of a profile: values of a parameter from the best one towards a limit."""
 
     distances: list[float]
@@ -341,15 +319,16 @@ def fit_profiles(
     result: Fit,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Fit, dict[str, Profile]]:
-    """Return the fit at the likelihood's maximum, and the profile likelihood of each parameter.
+    """Return the fit at the likelihood's maximum and the profile likelihood of each parameter, from a first
+    fit.
 
-    Where a step of a profile is likelier than the fit, the fit starts again from there.
+    Where a profile finds a likelier point, the fit starts again from there.
 
     Args:
         likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
         result: result of :func:`fit`.
-        tick: function that is called with the share of the work done, which falls where the fit starts again.
+        tick: function called with the share of the work done, which falls where the fit starts again.
     """
     for _ in range(MOST_RESTARTS):
         profiles, higher = _search_profiles(likelihood, tunable, result, tick)
@@ -368,7 +347,9 @@ def _search_profiles(
     tick: Callable[[float], None],
     stop: bool = True,
 ) -> tuple[dict[str, Profile], numpy.ndarray | None]:
-    """Return the profiles, and a point of higher likelihood than the fit, or None; ``stop``: end there."""
+    """Compute the profiles; return also the point of higher likelihood at which ``stop`` ended the search, or
+    None.
+    """
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     information = _information(likelihood, best, limits)
@@ -387,8 +368,8 @@ def _search_profiles(
     return profiles, None
 
 
-def _profile(best: float, below: _Way, above: _Way) -> Profile:
-    """Return the profile of two sides and the best value, sorted, with its 95 % interval."""
+def _profile(best: float, below: _ProfileSide, above: _ProfileSide) -> Profile:
+    """Combine two sides and the best value to a sorted profile with its 95 % interval."""
     (low, open_low), (high, open_high) = _profile_end(below), _profile_end(above)
     values = numpy.array([*(best - d for d in below.distances), *(best + d for d in above.distances), best])
     drops, order = numpy.array([*below.drops, *above.drops, 0.0]), numpy.argsort(values)
@@ -397,7 +378,7 @@ def _profile(best: float, below: _Way, above: _Way) -> Profile:
 
 
 class _Maximum(NamedTuple):
-    """Maximum of a likelihood, and its curvature."""
+    """Maximum of a likelihood: place, value, curvature, and limits of the parameters."""
 
     at: numpy.ndarray
     log_likelihood: float
@@ -409,11 +390,11 @@ class _Maximum(NamedTuple):
 
 def _walk_profile(
     likelihood: WindowLikelihood, maximum: _Maximum, first: tuple[int, float], stop: bool
-) -> tuple[_Way, numpy.ndarray]:
-    """Return one side of a profile, up to where the likelihood has fallen enough, and its last point.
+) -> tuple[_ProfileSide, numpy.ndarray]:
+    """Compute one side of a profile, up to where the likelihood has fallen enough; return it and its last
+    point.
 
-    ``first`` is the number of the parameter, and its standard deviation upward or downward. With ``stop`` the walk ends
-    at a point of higher likelihood than the fit.
+    ``first`` is the number of the parameter, and its standard deviation upward or downward.
     """
     parameter, deviation = first
     best, (low, high) = maximum.at, maximum.limits
@@ -423,7 +404,7 @@ def _walk_profile(
     # Where the likelihood is quadratic, the others follow this one on a straight line.
     inside = maximum.information[numpy.ix_(others, others)]
     slope = -sign * numpy.linalg.solve(inside, maximum.information[others, parameter])
-    way, point, reached = _Way([], []), best.copy(), 0.0
+    way, point, reached = _ProfileSide([], []), best.copy(), 0.0
     for distance in [*(d for d in numpy.array(STEPS) * abs(deviation) if d < room), room]:
         before = point.copy()
         before[parameter] = best[parameter] + sign * distance
@@ -451,7 +432,7 @@ def _maximise_others(
 ) -> tuple[numpy.ndarray, float]:
     """Maximise the likelihood over the parameters ``others``; return the point, and the log-likelihood there.
 
-    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B continues.
+    By Newton's steps as long as each gains, then by L-BFGS-B.
     """
     from scipy.optimize import minimize
 
@@ -501,7 +482,7 @@ def _newton_step(
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
-    """Return the information matrix at the maximum; directions without a maximum count as flat."""
+    """Return the information matrix at the maximum, with a floor for flat directions."""
     low, high = limits
     step = numpy.minimum(0.02, 0.01 * (high - low))
     H = _hessian(likelihood, numpy.clip(best, low + 2.0 * step, high - 2.0 * step), step)
@@ -511,8 +492,8 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
     return information
 
 
-def _profile_end(way: _Way) -> tuple[float, bool]:
-    """Return the distance at which the profile has fallen by ``DROP``, and whether the limit comes first."""
+def _profile_end(way: _ProfileSide) -> tuple[float, bool]:
+    """Interpolate the distance at which a profile has fallen by ``DROP``, and whether the limit comes first."""
     distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.
     roots = [0.0, *numpy.sqrt(numpy.clip(way.drops, 0.0, None)).tolist()]

@@ -1,4 +1,4 @@
-"""Comparison of competitors on two parts of a recording: one for the choice, one for the judgement."""
+"""Comparison of filters on two parts of a recording: one to choose among them, one to judge the chosen one."""
 
 import itertools
 import math
@@ -45,11 +45,7 @@ class Share(NamedTuple):
 
 
 def split_recording(recording: Recording) -> Share:
-    """Cut a recording into spans for the fit, the choice and the judgement: a half and two quarters of it.
-
-    Raises:
-        ValueError: if it has fewer than ``LEAST`` measurements.
-    """
+    """Cut a recording into spans for fit (half), choice (a quarter) and judgement (a quarter) of filters."""
     total = int(recording.rows.sum())
     if total < LEAST:
         raise ValueError(
@@ -75,7 +71,7 @@ def split_recording(recording: Recording) -> Share:
 
 
 class JudgedFilter(NamedTuple):
-    """Results of one filter on the measurements of choice and judgement."""
+    """Results of one filter on the measurements for choice and judgement, compared with a rival."""
 
     name: str
     fitted: bool
@@ -107,7 +103,7 @@ class JudgedFilter(NamedTuple):
 
 
 def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
-    """Return boolean masks ``(episodes, time)`` of the measurements for the choice and for the judgement."""
+    """Return masks ``(episodes, time)`` of the measurements for the choice and for the judgement."""
     choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
     masks = []
     for spans in (choosing, share.judged):
@@ -119,7 +115,7 @@ def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
 
 
 class Judgement:
-    """Comparison of all competitors on a log's measurements for the choice and for the judgement.
+    """Comparison of all filters on a recording's measurements for the choice and for the judgement.
 
     Args:
         scores: sums of all competitors.
@@ -147,7 +143,7 @@ class Judgement:
         self._chosen, self._judged = scores.log_likelihood
 
     def _least_error(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
-        """Return the name of the shipped filter of smallest mean square, or of highest likelihood without squares."""
+        """Return the shipped filter of smallest mean square, or without squares that of highest likelihood."""
         numbers = self._numbers
         means = {
             name: -log_likelihood.mean(numbers[name]) if squares is None else squares.mean(numbers[name])
@@ -158,8 +154,7 @@ class Judgement:
     def rival(self, operations: Callable[[str], float]) -> str:
         """Return the name of the shipped filter with which the fitted ones are compared.
 
-        It is the default where the likeliest does not beat it beyond chance, else the cheapest that is ``AS_GOOD`` as
-        the likeliest.
+        The default, unless the likeliest beats it beyond chance; then the cheapest that is ``AS_GOOD``.
 
         Args:
             operations: function from a competitor's name to the operations of its update.
@@ -178,9 +173,7 @@ class Judgement:
         return min(as_good, key=lambda name: (operations(name), -means[name]))
 
     def simplest(self, fitted: Sequence[JudgedFilter]) -> JudgedFilter:
-        """Return the first of the fitted filters, sorted simplest first, that the likeliest does not beat beyond
-        chance.
-        """
+        """Return the first, simplest fitted filter that the likeliest does not beat beyond chance."""
         likeliest = likeliest_of(fitted)
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
@@ -191,16 +184,18 @@ class Judgement:
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
 
     def _judged_squares(self) -> PairSums | None:
-        """Return the sums of squared errors in the judgement; without truth those of prediction errors."""
+        """Return the sums of judged squared errors, without truth those of prediction errors; None without
+        either.
+        """
         predicted = self.scores.predicted
         return self.scores.squared or (None if predicted is None else predicted[1])
 
     def best_shipped(self) -> str:
-        """Return the name of the shipped filter of smallest error on the measurements of the judgement."""
+        """Return the name of the shipped filter of smallest judged error."""
         return self._least_error(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
-        """Return the ratio of two filters' RMS errors in the judgement, less one; without truth of prediction
+        """Return the ratio of two filters' judged RMS errors, less one; without truth of their prediction
         errors.
         """
         squares, known = self._judged_squares(), self._numbers if self.scores.squared else self._predicting
@@ -209,24 +204,17 @@ class Judgement:
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Return the difference of two filters' penalised log-likelihoods on the measurements of the choice, nats.
-
-        The penalty is one nat in all for each fitted parameter.
-        """
+        """Return the difference of two filters' mean log-likelihoods, less one nat in all per parameter."""
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))
 
     def _penalty(self, name: str) -> float:
-        """Return the penalty of a filter: its number of fitted parameters over the measurements of the choice, nats."""
+        """Return a filter's number of fitted parameters over the number of measurements of the choice, nats."""
         return self.parameters.get(name, 0) / self.scores.chosen_measurements
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
-        """Return the names of the fitted filters that lose the track in the whole recording; none where all do.
-
-        Args:
-            fits: fits with their likelihood in windows.
-        """
+        """Return the fitted filters that lose the track when run over the whole recording; none where all do."""
         parts = self.scores.log_likelihood if self._share.apart else [self._chosen]
         totals = {name: [part.total(self._numbers[name]) for part in parts] for name in fits}
         sums = {name: sum(total for total, _ in each) for name, each in totals.items()}
@@ -241,7 +229,7 @@ class Judgement:
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
     def competitor(self, name: str, rival: str) -> JudgedFilter:
-        """Return a filter's results on the measurements for choice and judgement, paired with a rival's."""
+        """Return a filter's results in choice and judgement, paired with a rival's."""
         scores, i, other = self.scores, self._numbers[name], self._numbers[rival]
         penalty, predicts = self._penalty(name), name in self._predicting
         gain = self._chosen.difference(i, other)
@@ -262,7 +250,7 @@ class Judgement:
 
 
 def likeliest_of(competitors: Sequence[JudgedFilter]) -> JudgedFilter:
-    """Return the competitor of largest log-likelihood; where no competitor reports one, that of smallest error."""
+    """Return the filter of largest log-likelihood; where none reports one, that of smallest error."""
     known = [c for c in competitors if not math.isnan(c.log_likelihood)]
     if not known:
         return min(competitors, key=lambda c: (math.isnan(c.error), c.error))

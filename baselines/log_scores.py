@@ -1,8 +1,7 @@
 """Likelihoods and errors of competitors on a log, summed over stretches of it.
 
-All competitors process the log side by side, in chunks of measurements. Only sums over stretches are stored: of one
-competitor, and of each pair over the measurements for which both have values. So memory grows neither with the log nor
-with the number of competitors. Intervals are those of :mod:`.evaluation.statistics.predictions`.
+All competitors process the log side by side, in chunks of measurements, and only sums over stretches are
+stored.
 """
 
 import math
@@ -38,14 +37,14 @@ def report_scores(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the quantities drawn of a log after a measurement, arrays ``(..., N)`` by name."""
+    """Return the quantities to draw after a measurement, arrays ``(..., N)`` by name."""
     found = {**model.records(episode), **model.track(episode)}
     shown = ("estimate", "truth", *LIKELIHOOD)
     return {name: found[name] for name in found if name in shown or name.startswith("measurement_")}
 
 
 class PairSums:
-    """Sums of competitors' values over stretches of a log, for each pair over the measurements where both are finite.
+    """Sums over stretches of a log, for each pair over the measurements where both are finite.
 
     Args:
         competitors: number of competitors, n.
@@ -83,13 +82,13 @@ class PairSums:
         return total / count if count else math.nan
 
     def difference(self, i: int, j: int) -> IntervalEstimate:
-        """Return the mean of competitor i's values less j's, paired, with interval."""
+        """Return the paired mean of competitor i's values less j's, with its interval."""
         counts = self.counts[:, i, j]
         sums = numpy.stack([self.sums[:, i, j] - self.sums[:, j, i], counts], axis=1)
         return interval_of_sums(sums, counts, ratio)
 
     def relative_root(self, i: int, j: int) -> IntervalEstimate:
-        """Return the ratio of the root means of competitors i and j, less one, paired; the values are squares."""
+        """Return the paired ratio of the roots of two competitors' mean squares, less one, with its interval."""
         sums = numpy.stack([self.sums[:, i, j], self.sums[:, j, i]], axis=1)
         return interval_of_sums(sums, self.counts[:, i, j], lambda means: numpy.sqrt(ratio(means)) - 1.0)
 
@@ -111,7 +110,7 @@ class _Whiteness:
         self._counts = numpy.zeros(self._sums.shape[:2], dtype=int)
 
     def add(self, errors: numpy.ndarray, first: int) -> None:
-        """Add the products of prediction errors ``(m, E, rows)`` from measurement ``first`` on."""
+        """Add the products of successive prediction errors ``(m, E, rows)`` from measurement ``first`` on."""
         before = numpy.concatenate([self._last, errors[..., :-1]], axis=2)
         whole = numpy.concatenate([self._received, errors], axis=2)
         places = numpy.where(numpy.isfinite(whole), numpy.arange(whole.shape[2]), 0)
@@ -128,13 +127,15 @@ class _Whiteness:
                 self._sums[i, :, j] += numpy.bincount(stretch[there], pair[j][there], count)
 
     def correlations(self) -> list[IntervalEstimate]:
-        """Return the correlation of successive errors: of the first group, then of each measured number."""
+        """Return the correlations of successive prediction errors: of the first group, then of each measured
+        number.
+        """
         pairs = zip(self._sums, self._counts, strict=True)
         return [interval_of_sums(sums, counts, ratio) for sums, counts in pairs]
 
 
 def _products(errors: numpy.ndarray, before: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the products of errors with those before, and their mean squares; sums' ratio is the correlation."""
+    """Return products of successive errors and their mean squares, whose sums' ratio is the correlation."""
     return errors * before, 0.5 * (errors**2 + before**2)
 
 
@@ -221,7 +222,9 @@ class LogScores:
                 sums.add(squares, first)
 
     def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
-        """Return competitor i's squared prediction errors of the first group, and add their products to the sums."""
+        """Return competitor i's squared prediction errors of the first group, after adding their products to the
+        sums.
+        """
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
         assert self._format is not None
@@ -246,16 +249,18 @@ class LogScores:
         )
 
     def nis(self, i: int) -> float:
-        """Return competitor i's mean NIS over its dimension, on the measurements for the judgement; NaN: unknown."""
+        """Return competitor i's judged mean NIS over its dimension; NaN: unknown."""
         squares, degrees = self._nis[i].tolist()
         return squares / degrees if degrees else math.nan
 
     def correlation(self, i: int) -> IntervalEstimate:
-        """Return the correlation of competitor i's successive prediction errors in the judgement, first group."""
+        """Return the correlation of competitor i's successive judged prediction errors, of the first group."""
         return self._whiteness[i].correlations()[0]
 
     def correlations(self, i: int) -> dict[str, IntervalEstimate]:
-        """Return the correlation of competitor i's successive prediction errors of each measured number, by name."""
+        """Return the correlation of competitor i's successive prediction errors of each measured number, by its
+        name.
+        """
         assert self._format is not None
         found = self._whiteness[i].correlations()[1:]
         quantities = self._format.predicted[: len(found)]
@@ -264,7 +269,7 @@ class LogScores:
 
 
 def _start_runs(plan: Plan, report: Report) -> list[Iterator[dict[str, numpy.ndarray]]]:
-    """Return for each competitor an iterator that runs it over a log and yields reports of chunks."""
+    """Return an iterator for each competitor, which runs it over a log and yields reports by chunks."""
     rows, models = max(ROWS // len(plan.seeds), 1), plan.models
     return [
         run_stretches(models[name], maker, plan.kinds[name], plan.seeds, report, rows, name)
@@ -279,14 +284,7 @@ def score_log(
     roles: Roles,
     tick: Callable[[float], None] = lambda share: None,
 ) -> LogScores:
-    """Run competitors over a log, and return the sums of their likelihoods and errors.
-
-    Args:
-        experiment: experiment on the recording.
-        competitors: makers by name.
-        roles: roles of the measurements of the recording.
-        tick: function that is called with the share of the work done.
-    """
+    """Run competitors over a log; return the sums of their likelihoods and errors."""
     with numpy.errstate(all="ignore"):  # a diverging filter is judged by its numbers
         plan = plan_of(experiment, competitors)
         scores, runs = LogScores(plan, roles), _start_runs(plan, report_scores)
@@ -304,7 +302,7 @@ def score_log(
 
 @one_thread()
 def replay_log(experiment: Experiment, competitors: Mapping[str, Any]) -> "xarray.Dataset":
-    """Run competitors over a log, and return estimates and likelihoods of every measurement as a dataset."""
+    """Run competitors over a log; return estimates and likelihoods at every measurement as a dataset."""
     plan = plan_of(experiment, competitors)
     task = plan.models[next(iter(competitors))].task
     kept = plan.arrays(len(plan.seeds), len(plan.seeds))

@@ -1,6 +1,6 @@
 """Models of a sensor's noise variance: as stated, or estimated from the innovations.
 
-Competitors of several environments use them. Equation numbers are those of ``filters/noise_adaptation.py``.
+Equation numbers are those of ``filters/noise_adaptation.py``.
 """
 
 from collections.abc import Mapping
@@ -14,21 +14,20 @@ LEAST = 0.1
 
 
 class MeasurementNoise:
-    """Noise model of a sensor: its variance as stated; subclasses estimate it from innovations."""
+    """Model of a sensor's noise: its variance as stated; subclasses estimate it from innovations."""
 
     def start(self, stated: Array) -> Any:
-        """Return the memory at the start of a track, from the stated variance, ``(N,)``."""
+        """Return the memory at the start of a track, from the stated variance ``(N,)``; empty here."""
         return ()
 
     def update(
         self, memory: Any, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Any]:
-        """Return the noise variance of a measurement ``(N,)``, and the memory updated by its innovation.
+        """Return a measurement's noise variance, ``(N,)``, and the memory updated with its innovation.
 
         Args:
             memory: memory after the last measurement.
-            innovation: measurement less prediction, ``(N,)``; of several channels with the same noise the root of their
-                mean square.
+            innovation: measurement less prediction, ``(N,)``; of several channels their root mean square.
             P: variance of the predicted measurement without its noise, ``(N,)``.
             stated: stated variance, ``(N,)``.
             available: one where there is a measurement, ``(N,)``.

@@ -1,8 +1,7 @@
 """Comparison of a vehicle's own filter with fitted and shipped filters on fixes withheld from the latter.
 
-Every fifth fix of a log is withheld. Filters run over the others, and predict the withheld ones. The estimates of the
-vehicle's own filter come from the log; there is no truth. A fix is logged with a delay, so the estimate is read that
-much earlier: at the delay with the best agreement on the fixes that are not withheld.
+Every fifth fix of a log is withheld; filters run over the others and predict it. The estimates of the
+vehicle's own filter come from the log, at the delay with the best agreement on the other fixes.
 
 Leak: in flight that filter had every earlier fix, the withheld ones too, and an inertial sensor. So its error is an
 optimistic bound of its error without the withheld fixes.
@@ -55,16 +54,7 @@ def judge_onboard(
     makers: Mapping[str, Any],
     track: OnboardTrack,
 ) -> OnboardJudgement | None:
-    """Return errors of a vehicle's own filter and of others on withheld fixes; None without estimates at any.
-
-    Args:
-        problem: problem of the recording.
-        recording: positions in metres around its origin.
-        keywords: parameters of the task.
-        share: spans of its measurements for fit, choice and judgement.
-        makers: competitors by name, the advised one first.
-        track: estimates of the vehicle's own filter.
-    """
+    """Compare a vehicle's own filter with others on withheld fixes; None without its estimates at them."""
     times = recording.log_time
     if not recording.origin or times is None or times.dtype.kind != "f":
         return None
@@ -101,7 +91,7 @@ def judge_onboard(
 
 
 def _withhold(recording: Recording, withheld: numpy.ndarray) -> Recording:
-    """Return a copy of a recording in which the fixes of a boolean mask are missed measurements."""
+    """Return a copy of a recording in which some fixes are missed measurements."""
     measured = dict(recording.measurements)
     measured["available"] = numpy.where(withheld, 0.0, measured["available"])
     measured["position"] = numpy.where(withheld[..., None], 0.0, measured["position"])

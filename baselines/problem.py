@@ -30,7 +30,7 @@ class Problem:
 
     @classmethod
     def of(cls, task: type[Task]) -> "Problem":
-        """Return the problem of the environment that a task's class defines."""
+        """Return the problem of a task's class, with its registered baselines."""
         return cls(task, baselines_of(task.id), package_of(task.id))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -43,26 +43,24 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Id by which another process finds the environment: its Gymnasium id, with ``module:`` before a user's own."""
+        """Id by which another process imports the environment: its Gymnasium id, with ``module:`` before a
+        user's own.
+        """
         return importable_name(self.task)
 
     @property
     def is_shipped(self) -> bool:
-        """Whether this package contains it, so that its digest covers the code."""
+        """Whether this package contains the environment."""
         return self.name == self.id
 
     @property
     def short_name(self) -> str:
-        """Short name, for files and tables."""
+        """Id without namespace, for files and tables."""
         return short_name(self.id)
 
     @property
     def paper(self) -> str:
-        """Name of the policy that is the paper's algorithm.
-
-        Raises:
-            ValueError: if the baselines name none.
-        """
+        """Name of the policy that is the paper's algorithm; raise ValueError without one."""
         if not self.baselines.score_paper:
             raise ValueError(
                 f"{self.id} has no paper's algorithm to compare with: register it with baselines whose "
@@ -71,11 +69,10 @@ class Problem:
         return self.baselines.score_paper
 
     def paper_among(self, competitors: Mapping[str, Any]) -> str:
-        """Return which competitor is the paper's algorithm, the base of costs; empty if none is.
+        """Return the paper's algorithm among competitors, or else its usual name; empty if there is none.
 
         Args:
-            competitors: makers by name. The stronger reading of the paper is returned where it is among them, under its
-                name there.
+            competitors: makers by name; a stronger reading of the paper among them comes first.
         """
         known = self.baselines
         for reading in filter(None, (known.stronger_paper, known.score_paper)):
@@ -87,13 +84,13 @@ class Problem:
 
     @property
     def knows(self) -> dict[str, str]:
-        """What each reference and bound knows beyond the measurements, in words, by name."""
+        """What each reference and bound knows beyond the measurements, as text by name."""
         makers = {**self.baselines.references, **self.baselines.bounds}
         return {name: maker.knows for name, maker in makers.items()}
 
     @property
     def tuned_values(self) -> TunedValues:
-        """Stored values of its tuned policies and estimators."""
+        """Stored tuned values of its policies and estimators."""
         shipped = [] if self.shipped is None else [files(self.shipped) / "tuned.json"]
         return TunedValues(self.id, self.baselines.tunable, [table_path(self.id), *shipped])
 
@@ -108,10 +105,7 @@ class Problem:
         return [*self.baselines.names, *self.tuned_policies]
 
     def find(self, name: str) -> Any:
-        """Return the maker of a competitor of this name; None for an unknown name.
-
-        Tuned values are read only for a name that ends with ``-tuned``.
-        """
+        """Return the maker of a competitor of this name; None for an unknown name."""
         known = self.baselines
         for table in (known.policies, known.estimators, known.smoothers, known.references, known.bounds):
             if name in table:
@@ -121,11 +115,7 @@ class Problem:
         return None
 
     def competitor(self, name: str) -> Any:
-        """Return the maker of a competitor of this name; raise ValueError for an unknown name.
-
-        Raises:
-            ValueError: if there is no such name.
-        """
+        """Return the maker of a competitor of this name; raise ValueError for an unknown name."""
         found = self.find(name)
         if found is None and name.endswith("-tuned"):
             return self.tuned_values.competitor(name.removesuffix("-tuned"))  # raises with the reason
@@ -134,11 +124,8 @@ class Problem:
         return found
 
     def experiment(self, *arguments: Any, **fields: Any) -> Experiment:
-        """Return an :class:`.evaluate.Experiment` on this environment, with its paper's algorithm and reference.
-
-        Args:
-            *arguments: arguments of :class:`.evaluate.Experiment` after the task.
-            **fields: fields of :class:`.evaluate.Experiment`.
+        """Make an :class:`.evaluate.Experiment` in this environment, with its paper's algorithm and
+        reference.
         """
         known = self.baselines
         experiment = Experiment(self.task, *arguments, **fields)
@@ -152,14 +139,15 @@ class Problem:
         workers: Workers | None = None,
         **keywords: Any,
     ) -> "xarray.Dataset":
-        """Run competitors over the same episodes of this environment, and return the dataset of the evaluation.
+        """Run competitors over the same episodes of this environment; return the dataset of the evaluation.
 
         Args:
             competitors: makers by name.
             *arguments: arguments of :meth:`experiment`.
-            progress: function that is called with the number of measurements done.
-            workers: processes that share the work.
-            **keywords: fields of :meth:`experiment` that :data:`.evaluate.OPTIONS` names, and parameters of the task.
+            progress: function called with the number of measurements done.
+            workers: processes for the work.
+            **keywords: fields of :meth:`experiment` that :data:`.evaluate.OPTIONS` names, and parameters of
+                the task.
         """
         options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
         experiment = self.experiment(*arguments, **options, keywords=keywords)
@@ -168,18 +156,10 @@ class Problem:
 
 
 def problem_of(id: str) -> Problem:
-    """Return the problem (task and baselines) of a registered environment's id.
-
-    Raises:
-        ValueError: for an unknown environment.
-    """
+    """Return the problem of a registered environment's id."""
     return Problem.of(task_class(id))
 
 
 def import_problem(id: str) -> Problem:
-    """Return the problem (task and baselines) of an id; ``module:id`` imports the module first.
-
-    Raises:
-        ValueError: for an unknown environment, or if its module cannot be imported.
-    """
+    """Return the problem of an id; ``module:id`` imports the module first."""
     return Problem.of(import_task(id))

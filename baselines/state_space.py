@@ -1,4 +1,4 @@
-"""Baselines of a user's state-space model: its Kalman filter, other filters, and the filter with the true model."""
+"""Baselines of a user's state-space model, such as its Kalman filter and the filter with the true model."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ class StateSpaceKalman(ConstantPolicy):
 
 
 class CovarianceMatching(Policy):
-    """Process noise raised while the normalised innovation squared is above its mean, and lowered while it is below."""
+    """Policy that raises the process noise while the NIS is above its mean, and lowers it while it is below."""
 
     control = "noise"
     traceable = True
@@ -45,7 +45,9 @@ class CovarianceMatching(Policy):
         self.nis, self.last, self.available = (model.reader(n) for n in ("nis", "last_action", "available"))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the last action changed by a step, as the NIS is above or below its mean."""
+        """Return the last action, its process noise a step larger or smaller as the NIS is above or below its
+        mean.
+        """
         degrees = numpy.sum(self.available(observation), axis=1)
         excess = numpy.minimum(self.nis(observation)[:, 0], 5.0 * degrees) - degrees
         process = numpy.clip(self.last(observation)[:, 0] + self.step * excess, -1.0, 1.0)
@@ -53,7 +55,7 @@ class CovarianceMatching(Policy):
 
 
 class StateSpaceInteractingMultipleModel(ConstantPolicy):
-    """The interacting multiple model of the hypotheses."""
+    """The interacting multiple model of the user's hypotheses, without added evidence."""
 
     control = "evidence"
 
@@ -73,12 +75,12 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
 
 
 def _zero_missing(measurement: StateSpaceMeasurement, xp: Any) -> Array:
-    """Return a measurement's values ``(m, N)`` with zero in place of missing ones."""
+    """Return a measurement's values ``(m, N)``, with zero for missing ones."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
 class Past(NamedTuple):
-    """A measurement in the buffer, for which late values may still arrive."""
+    """A measurement in a filter's buffer, for which late values may still arrive."""
 
     measurement: StateSpaceMeasurement
     truth: Any
@@ -117,7 +119,7 @@ class Buffered(NamedTuple):
 
 
 def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
-    """Return a filter's initial state, inside an empty :class:`Buffered` where measurements may arrive late."""
+    """Return a filter's initial state, with an empty buffer where measurements may arrive late."""
     if not task.parameters.late:
         return begun
     own, none = task.definition, 0.0 * begun.mean[0]
@@ -136,14 +138,7 @@ def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
 def _in_order(
     state: Any, measurement: StateSpaceMeasurement, step: Callable[..., Any], truth: Any = None
 ) -> Any:
-    """Return the state after a measurement, with a late one that arrives with it processed in its place.
-
-    Args:
-        state: state of the filter, or a :class:`Buffered` one.
-        measurement: measurement that was received.
-        step: function of the filter's state and a :class:`Past` that returns the state after it.
-        truth: truth given to the step of a reference.
-    """
+    """Return the state after a measurement; late values that arrive with it are processed in their place."""
     if not isinstance(state, Buffered):
         return step(state, Past(measurement, truth, None))
     xp = namespace(measurement.available)
@@ -164,10 +159,7 @@ def _in_order(
 class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
     """The Kalman filter of the user's model, extended where it is not linear, as an estimator.
 
-    A late measurement is processed in its place.
-
     Args:
-        task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
         **noises: factors on some sources of Q, and on R of some sensors, by their names with ``_noise``.
@@ -183,26 +175,26 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """Return Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return Q at a predicted mean ``(n, N)``, times its factors, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """Return R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return R at a predicted mean ``(n, N)``, times its factors, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
-        """Return the filter's state at the start of a track, from the initial estimate."""
+        """Return the state at the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
     def update(self, state: Any, inputs: FilterInput) -> Any:
-        """Predict to a measurement, update with it, and return the state."""
+        """Predict to a measurement and update with it; return the state."""
         return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Return the state predicted to a measurement and updated with it."""
         measurement = one.measurement
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
         R = self.sensor_noise(mean, measurement)
         result = _update(self.equations, mean, carried + Q, R, measurement, self.xp)
@@ -221,10 +213,7 @@ def _update(
 class ExtendedSmoother(Extended):
     """The Kalman filter of the user's model, smoothed with all later measurements (Rauch, Tung and Striebel 1965).
 
-    A late measurement is smoothed in its place.
-
     Args:
-        task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
         lag: number of later measurements that each estimate uses; default: all of them.
@@ -247,7 +236,9 @@ class ExtendedSmoother(Extended):
     def smooth(
         self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
     ) -> tuple[Array, Array]:
-        """Return means and covariances of the whole track, smoothed with all later measurements or those in the lag."""
+        """Return means and covariances of a track, smoothed with all later measurements or those within the
+        lag.
+        """
         measured, memories = scans.stack_scans(measurements), scans.stack_scans(states)
         if isinstance(memories, Buffered):
             measured = _put_in_order(measured, self.task.parameters.lateness, self.xp)
@@ -258,12 +249,8 @@ class ExtendedSmoother(Extended):
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
     def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
-        """Return the filtered estimates at the start and at K measurements, with late ones in their places.
-
-        Args:
-            settled: estimates ``lateness`` measurements before the start and before each measurement, at least those at
-                the start, ``(..., K + 1, N)``.
-            measured: measurements in order, ``(..., K, N)``.
+        """Filter a track again with late values in their places; return the estimates at start and
+        measurements.
         """
         K = measured.available.shape[-2]
         known = max(K - self.task.parameters.lateness, 0)
@@ -286,7 +273,7 @@ class ExtendedSmoother(Extended):
 
 
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
-    """Return measurements ``(..., K, N)`` with late values moved to the measurements to which they belong."""
+    """Move late values to the measurements ``(..., K, N)`` to which they belong."""
     plain = measured._replace(values=_zero_missing(measured, xp), late=None, late_available=None)
     assert measured.late is not None
     assert measured.late_available is not None
@@ -316,7 +303,7 @@ class Unscented(Extended):
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
-        """Return the state at the initial estimate, with its covariance made positive definite."""
+        """Return the state at the initial estimate, its covariance made positive definite."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
@@ -354,11 +341,11 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         self.bank: MultipleModelBank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
-        """Return the filter's state at the start of a track, from the initial estimate."""
+        """Return the state at the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
     def update(self, state: Any, inputs: FilterInput) -> Any:
-        """Predict to a measurement and update with it, without an action; return the state."""
+        """Predict the bank to a measurement and update it without an action; return the state."""
         return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: Mixture, one: Past) -> Mixture:
@@ -374,9 +361,7 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
 
 
 class KnownModel:
-    """The Kalman filter, extended where the model is not linear, that knows the true model: functions, Q and R of this
-    episode, and the true hypothesis.
-    """
+    """The (extended) Kalman filter with the true functions, Q and R of this episode, and the true hypothesis."""
 
     kind = "reference"
     traceable = True
@@ -387,7 +372,7 @@ class KnownModel:
         self.xp: ModuleType = task.xp
 
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
-        """Return the filter's state at the start of a track, from the initial estimate."""
+        """Return the state at the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun, self._model_truth(truth))
 
@@ -403,11 +388,11 @@ class KnownModel:
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Return the state predicted to a measurement and updated with it."""
+        """Predict to a measurement by the true model and update with it; return the state."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):
-            mean, carried = equations.carry(state.mean, state.covariance, measurement)
+            mean, carried = equations.predict_moments(state.mean, state.covariance, measurement)
             P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = equations.sensor_noise(mean, measurement, truth.measurement_noise)
             result = _update(equations, mean, P, R, measurement, xp)
@@ -422,11 +407,7 @@ class KnownModel:
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the noise factors in two groups: by source of Q, and by sensor.
-
-    Raises:
-        ValueError: for a name that is neither.
-    """
+    """Split noise factors by name into those of sources of Q and those of sensors."""
     named = {name.removesuffix(NOISE): factor for name, factor in noises.items()}
     sources = task.definition.filters[0].sources
     known = [*sources, *(channel.name for channel in task.definition.channels)]
@@ -438,7 +419,7 @@ def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any],
 
 
 def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
-    """Return the limits of the noise factors that are tuned, by name: lowest, untuned, highest."""
+    """Return lowest, untuned and highest value of each tunable noise factor, by name."""
 
     def names(of: Iterable[str], else_all: str) -> list[str]:
         several = [name + NOISE for name in of]
@@ -453,11 +434,7 @@ def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
-    """Return the baselines of a user's state-space model.
-
-    Args:
-        task: class of the task.
-    """
+    """Make the table of baselines for a user's state-space model."""
     several = len(task.definition.filters) > 1
     linear = all(model.is_linear for model in task.definition.filters)
     policies: dict[str, Any] = {

@@ -55,7 +55,7 @@ def tunable(
     /,
     **values: tuple[float, float, float],
 ) -> Tunable:
-    """Declare which keywords of a policy or an estimator are tuned.
+    """Declare which keywords of a policy or an estimator can be tuned, and their limits.
 
     Args:
         make: its class, or a :class:`Variant`.
@@ -77,7 +77,9 @@ def tunable(
 
 
 def without_logarithms(values: Mapping[str, float]) -> dict[str, float]:
-    """Return values by keyword, with ``10 ** value`` for those whose names begin with ``log10_``."""
+    """Return values by keyword: ``10 ** value`` for names that begin with ``log10_``, which the keyword
+    omits.
+    """
     return {
         name.removeprefix("log10_"): 10.0**value if name.startswith("log10_") else value
         for name, value in values.items()
@@ -91,7 +93,7 @@ class Variant(functools.partial[Any]):
     """
 
     def __new__(cls, make: Callable[..., Any], description: str = "", /, **arguments: Any) -> "Variant":
-        """Return a competitor's class with some arguments bound, as its maker.
+        """Bind arguments of a competitor's class, with a description of the result.
 
         Args:
             make: the class.
@@ -115,12 +117,7 @@ class PaperAction(ConstantPolicy):
 
 
 class ConstantMode(Policy):
-    """A policy that always chooses the same mode.
-
-    Args:
-        model: the environment's model for the policy.
-        mode: number of the mode; a negative one counts from the last.
-    """
+    """A policy that always chooses the same mode."""
 
     control = "mode"
     traceable = True
@@ -130,7 +127,7 @@ class ConstantMode(Policy):
         self.mode: int = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the constant mode as action of every episode, ``(N,)``."""
+        """Return the constant mode as action of every episode, ``(N,)``, and no memory."""
         return numpy.full(len(observation), self.mode), None
 
 
@@ -193,7 +190,7 @@ class Baselines:
 
     @property
     def compared_paper(self) -> str:
-        """Reading of the paper's algorithm that is the base of costs where all readings take part."""
+        """Name of the paper's algorithm to which costs are relative: its stronger reading, if there is one."""
         return self.stronger_paper or self.score_paper
 
     @property

@@ -39,7 +39,7 @@ class Tuned:
 
 @dataclass(frozen=True, eq=False)
 class TunedPolicy:
-    """A policy or estimator with tuned values, some of which belong to the task."""
+    """Maker of a policy or estimator with tuned values, some of which are parameters of the task."""
 
     task_keywords: dict[str, Any]
     control: str | None
@@ -64,7 +64,7 @@ class TunedPolicy:
         return "policy" if self.control else "estimator"
 
     def __call__(self, problem: Any) -> Any:
-        """Return the policy, made for a model, or the estimator, made for a task."""
+        """Make the policy for a model, or the estimator for a task."""
         return self.make(problem)
 
 
@@ -83,12 +83,12 @@ class TunedValues:
             yield place, read_table(place)
 
     def names(self) -> list[str]:
-        """Return the name ``NAME-tuned`` of every policy and estimator that has stored values."""
+        """Return the names ``NAME-tuned`` of the policies and estimators that have stored values."""
         tables = [table for _, table in self._tables()]
         return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
 
     def is_improved(self, policy: str) -> bool:
-        """Return whether the stored values of a policy differ from the untuned ones, which a search may also store."""
+        """Return whether the stored values of a policy differ from the untuned ones."""
         start = {name: round_value(value) for name, value in self.tunable[policy].start.items()}
         return self.values(policy)[0] != start
 
@@ -96,7 +96,7 @@ class TunedValues:
         """Return the name of the tuned policy of least cost on the validation split; None without one.
 
         Args:
-            control: only policies of this control; estimators have no control and are excluded.
+            control: only policies of this control.
         """
         entries: dict[str, dict[str, Any]] = {}
         for _, table in reversed(list(self._tables())):  # the user's take precedence over the shipped ones
@@ -109,11 +109,7 @@ class TunedValues:
         return min(found, key=lambda name: found[name], default=None)
 
     def values(self, policy: str) -> tuple[dict[str, float], str]:
-        """Return the stored values of a policy by name, and the path of their file.
-
-        Raises:
-            ValueError: if the policy was never tuned, or its file is broken.
-        """
+        """Return the stored values of a policy by name, and the path of their file."""
         for place, table in self._tables():
             if policy in table:
                 return self._check(table[policy].get("values"), policy, place), str(place)
@@ -122,7 +118,7 @@ class TunedValues:
         )
 
     def _check(self, values: Any, policy: str, place: Any) -> dict[str, float]:
-        """Return stored values; raise ValueError unless they are a policy's, within the limits of the search."""
+        """Return stored values of a policy unchanged, or raise ValueError unless they are within its limits."""
         try:
             return check_values(values, self.tunable[policy])
         except ValueError as error:
@@ -131,11 +127,7 @@ class TunedValues:
             ) from error
 
     def competitor(self, policy: str) -> TunedPolicy:
-        """Return the maker of a policy or estimator with its stored values.
-
-        Raises:
-            ValueError: if it cannot be tuned, or never was.
-        """
+        """Return the maker of a policy or estimator with its stored values; raise ValueError without any."""
         if policy not in self.tunable:
             raise nearest("tunable policy", policy, self.tunable)
         tunable = self.tunable[policy]
@@ -144,17 +136,8 @@ class TunedValues:
 
 
 def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
-    """Return the values of a policy or estimator from a file, validated.
-
-    Args:
-        values: values from the file.
-        tunable: declaration of the values.
-
-    Returns:
-        The values by the names of the parameters.
-
-    Raises:
-        ValueError: if they are not a number for each parameter, within its limits.
+    """Return values from a file unchanged, or raise ValueError unless there is one in the limits for each
+    parameter.
     """
     limits = tunable.limits
     if not has_type(values, dict[str, float]) or values.keys() != limits.keys():
@@ -173,13 +156,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
 
 
 def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
-    """Return the maker of a policy or estimator with the given tuned values.
-
-    Args:
-        name: name of environment and policy; the same name means the same code.
-        tunable: declaration of the values.
-        values: values by name.
-    """
+    """Return the maker of a policy or estimator with these values."""
     keywords, make = tunable.apply(values)
     content = f"{name} {sorted(values.items())!r}"
     return TunedPolicy(keywords, tunable.control, make, content, tunable.anchored, tunable, values)
@@ -191,11 +168,7 @@ def round_value(value: float) -> float:
 
 
 def read_table(place: Any) -> dict[str, dict[str, Any]]:
-    """Return the entries of a file of tuned values, by policy; empty if there is no file.
-
-    Raises:
-        ValueError: if it is not such a file.
-    """
+    """Read a file of tuned values; return its entries by policy, empty if there is no file."""
     try:
         table = read_json(place)
     except FileNotFoundError:
@@ -206,7 +179,7 @@ def read_table(place: Any) -> dict[str, dict[str, Any]]:
 
 
 def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
-    """Write tuned values to the environment's file in a folder, and return its path.
+    """Write tuned values into the environment's file, whose other entries remain; return its path.
 
     Args:
         outcome: outcome of a search.

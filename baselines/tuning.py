@@ -1,4 +1,4 @@
-"""Tuning of classical competitors on training episodes, so that learned agents are compared with tuned ones.
+"""Tuning of classical competitors on training episodes.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
 values; every candidate runs on the same episodes of the training split, so differences are not noise. Costs are
@@ -58,8 +58,10 @@ class Candidate(NamedTuple):
     backend: str = "auto"
 
 
-def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or (1) with likelihood."""
+def _run_candidate(candidate: Candidate, tick: Progress) -> numpy.ndarray:
+    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or (1) with
+    likelihood.
+    """
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
@@ -78,7 +80,7 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
-    found: numpy.ndarray = numpy.concatenate(workers.results(_costs, pieces))
+    found: numpy.ndarray = numpy.concatenate(workers.results(_run_candidate, pieces))
     return found
 
 
@@ -88,8 +90,8 @@ def geometric_cost(costs: numpy.ndarray) -> float:
 
 
 def is_better(costs: numpy.ndarray, others: numpy.ndarray) -> bool:
-    """Return whether costs are significantly lower than others on the same episodes, by the geometric mean of their
-    ratios.
+    """Return whether costs are significantly lower than others, by the geometric mean of their ratios by
+    episode.
     """
     return Bootstrap(len(costs)).estimate(numpy.log(costs / others)).high < 0.0
 
@@ -109,17 +111,11 @@ class Search:
     confirming: int = 2048
     """Number of validation episodes on which the best candidate has to beat the untuned values."""
     backend: str = "auto"
-    """Backend of the steps, see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, see :func:`.engine.backend.make_model`."""
 
 
 class _Generations:
-    """Candidates of a search, evaluated within the budget, and the best of them so far.
-
-    Args:
-        tunable: declaration of the searched values.
-        allowed: number of candidates within the budget.
-        measure: returns the cost of a candidate's values.
-    """
+    """Candidates of a search, evaluated within the budget, and the best of them so far."""
 
     def __init__(
         self, tunable: Tunable, allowed: int, measure: Callable[[Mapping[str, float]], float]
@@ -129,7 +125,9 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Return the cost of a vector of candidate values; infinite when the search's budget is spent."""
+        """Return the cost of a vector of candidate values, and remember the best; infinite when the budget is
+        spent.
+        """
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))
@@ -139,7 +137,7 @@ class _Generations:
         return cost
 
     def run(self, population: int, generator: numpy.random.Generator) -> dict[str, float]:
-        """Run differential evolution from a population until the budget is spent; return the best vector."""
+        """Run differential evolution from a population until the budget is spent; return the best values."""
         from scipy.optimize import differential_evolution
 
         limits = list(self.tunable.limits.values())
@@ -159,12 +157,8 @@ class _Generations:
         return self.best[1]
 
 
-def _scenario(problem: Problem, name: str | None) -> Scenario:
-    """Return the scenario of a search by its name; None: the default one.
-
-    Raises:
-        ValueError: if it is held out.
-    """
+def _training_scenario(problem: Problem, name: str | None) -> Scenario:
+    """Return the scenario of this name, the default one for None; raise ValueError for a held-out one."""
     chosen = find_scenario(problem.task, name)
     if not chosen.training:
         allowed = [s.name for s in problem.task.scenarios.values() if s.training]
@@ -182,19 +176,16 @@ def tune(
     workers: Workers | None = None,
     store: Store | None = None,
 ) -> Tuned:
-    """Search the values of a policy or estimator on training episodes, and return the best ones.
+    """Search the values of a policy or estimator on training episodes; return the best ones.
 
     Args:
         problem: problem of the policy.
         policy: name of a tunable policy or estimator.
         search: options of the search.
-        progress: function that is called with the number of environment steps done.
-        workers: processes that share the episodes of a candidate; candidates run one after another, since the search
-            uses the results of each. Default: this process.
-        store: storage for the costs of candidates until the search has ended, so that a second call continues an
-            interrupted
-            search: it evaluates the same candidates. Costs of a user's environment are not stored, since its code may
-            have changed. Default: no costs are stored.
+        progress: function called with the number of environment steps done.
+        workers: processes for the episodes of a candidate; candidates run one after another.
+        store: storage of candidates' costs, with which a second call continues an interrupted search; not
+            used for a user's environment.
 
     Raises:
         ValueError: for a policy that cannot be tuned, a held-out scenario, a budget too small for one generation, or a
@@ -203,7 +194,7 @@ def tune(
     if policy not in problem.baselines.tunable:
         raise nearest("tunable policy", policy, problem.baselines.tunable)
     tunable = problem.baselines.tunable[policy]
-    chosen = _scenario(problem, search.scenario)
+    chosen = _training_scenario(problem, search.scenario)
     task = make_task(problem.task, chosen.name)
     steps = search.episodes * (task.horizon // task.decision_interval)
     evaluations = search.budget // steps
@@ -245,7 +236,7 @@ def tune(
 
 
 def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
-    """Return what determines a candidate's cost beside values and code, as the key of stored costs."""
+    """Return all that determines a candidate's cost beside values and code, as the key of stored costs."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
     how = [search.seed, search.episodes, search.backend, tunable.likelihood]
     return [problem.id, scenario.name, limited, dict(tunable.start), *how]

@@ -4,9 +4,9 @@
     python benchmarks/budgeted_sensing.py --agent runs/sensing-0 --agent runs/sensing-1
 
 Two tables in Markdown. The first is of episodes. The second excludes the semi-Markov bank: it uses covariances alone,
-of the Gauss-Markov course with the moments of the semi-Markov one, without random quantities. There no schedule costs
-less than the best evenly spaced looks at each target by itself, at rates whose sum is one look a second (P. Whittle,
-Restless bandits, J. Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
+of the Gauss-Markov course with the same moments, without random quantities. There no schedule costs less than the best
+evenly spaced looks at each target by itself, at rates whose sum is one look a second (P. Whittle, Restless bandits, J.
+Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
 """
 
 import argparse
@@ -36,7 +36,7 @@ def interval(values: Any, digits: int = 3) -> str:
 
 
 def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
-    """Return table rows: cost of each policy in a scenario, relative to the rival's on the same noise."""
+    """Return table rows: cost of each policy relative to the rival's on the same noise, and lost targets."""
     dataset = filtergym.evaluate(
         sensing.BudgetedSensing.id, competitors, scenario=scenario, episodes=EPISODES[scenario]
     )
@@ -72,8 +72,7 @@ def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
     """Return a lower bound ``(N,)`` on the mean cost of targets that share one measurement a second.
 
-    Args:
-        costs: costs of each target by the seconds between its looks, ``(GAPS, 4, N)``.
+    ``costs`` of each target by the seconds between its looks: ``(GAPS, 4, N)``.
     """
     rates = 1.0 / numpy.arange(1.0, GAPS + 1.0)[:, None, None]
     prices = numpy.geomspace(1e-2, 1e6, 400)
@@ -119,7 +118,6 @@ def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
 
 
 def main() -> None:
-    """Print the tables of episodes and of covariances."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

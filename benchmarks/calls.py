@@ -18,9 +18,8 @@ Sections, without ``logs`` by default, which takes minutes:
     Processor seconds and peak memory of ``advise``, of ``evaluate`` with truth and of the smoother, over logs of
     ``--rows`` rows, and of ``evaluate`` of ten competitors over as many episodes.
 
-``--against`` names the Python of another checkout: both versions are measured in turn, round after round, each with its
-own peers in one process, and the table has both. A figure is the median over rounds. Times are of the processor unless
-the row is marked "wall".
+``--against`` names the Python of another checkout: both versions are measured in turn, each with its own peers in one
+process. A figure is the median over rounds, of processor time unless the row is marked "wall".
 """
 
 import argparse
@@ -54,7 +53,6 @@ Figures = Iterator[tuple[str, float]]
 def seconds_of(
     call: Callable[[], object], count: int, clock: Callable[[], float] = time.process_time
 ) -> float:
-    """Return the mean seconds of a call, over ``count`` calls."""
     begin = clock()
     for _ in range(count):
         call()
@@ -62,7 +60,6 @@ def seconds_of(
 
 
 def measure_single() -> Figures:
-    """Return the times of ``step`` and ``reset`` of single environments, and of Gymnasium's own."""
     import gymnasium
 
     import filtergym
@@ -89,7 +86,6 @@ def measure_single() -> Figures:
 
 
 def measure_vectors() -> Figures:
-    """Return the times of ``step`` of vector environments, with one thread and with two, and of a wide one."""
     import gymnasium
 
     import filtergym
@@ -117,7 +113,6 @@ def measure_vectors() -> Figures:
 
 
 def measure_live() -> Figures:
-    """Return the times of ``update`` of running filters, and of filterpy's."""
     import numpy
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
@@ -179,7 +174,6 @@ def child_cost(code: str, folder: str) -> tuple[float, float]:
 
 
 def measure_start() -> Figures:
-    """Return the processor times of processes that make, reset and step an environment, with a full code cache."""
     code = "import gymnasium\n{more}env = gymnasium.make({id!r}); env.reset(); env.step(env.action_space.sample())"
     ids = {"CartPole": "CartPole-v1"} | {k: f"filtergym/{v}-v0" for k, v in ENVIRONMENTS.items()}
     for letter, id in ids.items():
@@ -214,7 +208,6 @@ TRACK = "filtergym/ManeuveringTarget-v0"
 
 
 def measure_logs(rows: Sequence[int]) -> Figures:
-    """Return time and memory of ``advise`` and ``evaluate`` over logs and episodes of increasing number."""
     policies = [word for name in COMPETITORS for word in ("--policy", name)]
     log = ["evaluate", TRACK, "--recording", "truth.csv", "--speeds", "0.0001,100000", "--policy"]
     for count in rows:
@@ -240,7 +233,6 @@ def measure_logs(rows: Sequence[int]) -> Figures:
 
 
 def measure(section: str, rows: Sequence[int]) -> Figures:
-    """Return the figures of a section, measured in this process."""
     if section == "logs":
         return measure_logs(rows)
     return {
@@ -252,7 +244,6 @@ def measure(section: str, rows: Sequence[int]) -> Figures:
 
 
 def main() -> None:
-    """Read the command line, measure in separate processes, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

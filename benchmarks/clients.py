@@ -5,13 +5,12 @@
     python benchmarks/clients.py --recipes              # output of the recipes of docs/recipes.md
 
 **Installing.** Each client gets a virtual environment ``build/clients/NAME`` with access to the packages of this one,
-and with the versions of ``docs/recipes/NAME.txt`` in addition or instead: so torch is not downloaded again, and the
-pins of clients do not conflict. A client that is not installed there is imported from this environment, if available.
+and with the versions of ``docs/recipes/NAME.txt``: so torch is not downloaded again, and the pins of clients do not
+conflict. A client that is not installed there is imported from this environment.
 
 **Timing.** Random actions (with Stable-Baselines3's family: PPO or TQC at the start of learning) through the client's
 own rollouts of default environments, for about a second after a warm-up; in a process for each client and environment,
-with one thread. ``native``: the native vector environment; otherwise single ones, side by side where the client
-supports it.
+with one thread. ``native``: the vector environment of filtergym; otherwise single ones, side by side where supported.
 """
 
 import argparse
@@ -73,8 +72,6 @@ def random_steps(env: Any) -> Portion:
 
 
 def make_training_portion(model: Any) -> Portion:
-    """Return a portion in which a model of Stable-Baselines3 collects steps and learns."""
-
     def portion() -> int:
         model.learn(PORTION * model.n_envs)
         return model.num_timesteps
@@ -210,7 +207,6 @@ def minari_single(id: str) -> Portion:
     names = iter(range(10**9))
 
     def portion() -> int:
-        """Record two episodes with Minari, read them, and return the number of steps."""
         env = minari.DataCollector(gymnasium.make(id))
         for _ in range(2):
             env.reset()
@@ -262,7 +258,6 @@ CLIENTS: dict[str, tuple[str, str, Callable[[str], Portion]]] = {
 
 
 def install(name: str) -> None:
-    """Create the virtual environment of a client and install its packages."""
     folder = ENVIRONMENTS / name
     print(f"installing {name} into {folder.relative_to(ROOT)}", flush=True)
     venv.create(folder)  # without pip: this environment's serves both
@@ -277,13 +272,11 @@ def install(name: str) -> None:
 
 
 def python_of(name: str) -> str:
-    """Return the path of the Python that runs a client: of its virtual environment, or this one."""
     own = ENVIRONMENTS / name / "bin" / "python"
     return str(own) if own.exists() else sys.executable
 
 
 def measure(client: str, id: str) -> dict[str, Any]:
-    """Return the steps per second of a client in an environment, or the reason of its failure, by name."""
     _, distribution, rollouts = CLIENTS[client]
     try:
         version = importlib.metadata.version(distribution)
@@ -304,7 +297,6 @@ def measure(client: str, id: str) -> dict[str, Any]:
 
 
 def measure_in_client(client: str, id: str) -> dict[str, Any]:
-    """Return the result of :func:`measure`, run in the client's own Python."""
     command = [python_of(CLIENTS[client][0]), __file__, "--measure", client, "--environment", id]
     try:
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT)
@@ -318,7 +310,6 @@ def measure_in_client(client: str, id: str) -> dict[str, Any]:
 
 
 def table(clients: list[str], ids: list[str]) -> None:
-    """Measure clients in environments, and print the table in Markdown, row by row."""
     names = [id.partition("/")[2].rpartition("-v")[0] for id in ids]
     print("| steps/s | version |", " | ".join(names), "|")
     print("|---|---|" + "---|" * len(ids))
@@ -340,7 +331,6 @@ def table(clients: list[str], ids: list[str]) -> None:
 
 
 def recipes() -> None:
-    """Run every recipe, and print the last line of its output and its time."""
     print("| recipe | seconds | prints |\n|---|---|---|")
     for file in sorted(RECIPES.glob("with_*")):
         python = python_of(file.stem.removeprefix("with_"))

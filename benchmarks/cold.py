@@ -4,12 +4,11 @@
 
 Every command runs twice in a folder of its own that is the user's home and contains the code cache: cold, where both
 are empty, then warm. A figure is of the whole process with its children: processor seconds, and seconds that pass
-(wall). Other processes on the machine affect the second and, through its caches, slightly the first: use ratios.
+(wall). Other processes affect the second and, through caches, slightly the first: use ratios.
 
 Two policies are evaluated over 500 episodes, and the benchmark is the quick one in one process. ``--quick`` leaves
-out the benchmark, which takes minutes, and all evaluations but that of ManeuveringTarget; ``--only`` runs
-those whose name contains the word; ``--record`` writes the results to ``docs/records/cold.json``, whose table the
-documentation shows, and leaves other rows unchanged.
+out the benchmark and all evaluations but that of ManeuveringTarget; ``--only`` runs those whose name contains the word;
+``--record`` replaces these rows of ``docs/records/cold.json``.
 """
 
 import argparse
@@ -55,7 +54,7 @@ LIMIT_S = 1200
 
 
 class Cost(NamedTuple):
-    """Time of a process."""
+    """Processor and wall time of a process, s."""
 
     processor: float
     """Processor time, s."""
@@ -64,7 +63,7 @@ class Cost(NamedTuple):
 
 
 def commands(quick: bool) -> dict[str, list[str]]:
-    """Return the words of each measured command, by its name in the table."""
+    """Return each measured command as a list of words, by its name in the table."""
     front_door = [sys.executable, "-m", "filtergym"]
     found = {
         "make and first step, TightlyCoupledNavigation": [
@@ -88,11 +87,7 @@ def commands(quick: bool) -> dict[str, list[str]]:
 
 
 def measure(command: Sequence[str], home: Path) -> Cost:
-    """Run a command with a folder as the user's home, and return its time.
-
-    Raises:
-        RuntimeError: if it fails.
-    """
+    """Run a command with a folder as the user's home, and return its times; a failure raises RuntimeError."""
     environment = {
         **os.environ,
         "HOME": str(home),
@@ -112,14 +107,13 @@ def measure(command: Sequence[str], home: Path) -> Cost:
 
 
 def row(name: str, cold: Cost, warm: Cost) -> list[str]:
-    """Return the table row of a command: times with an empty and with a full cache."""
     seconds = [f"{value:.1f}" for value in (cold.processor, warm.processor)]
     wall = [f"{value:.1f}" for value in (cold.wall, warm.wall)]
     return [name, *seconds, f"{cold.processor / warm.processor:.2f}", *wall]
 
 
 def write_record(rows: Sequence[Sequence[str]]) -> None:
-    """Write rows to the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
+    """Replace the rows of measured commands in the record file, in the order of :func:`commands`."""
     known = json.loads(RECORD.read_text(encoding="utf-8"))["data"]["rows"] if RECORD.exists() else []
     by_name = {each[0]: list(each) for each in [*known, *rows]}
     versions = {"Python": platform.python_version()}
@@ -135,7 +129,6 @@ def write_record(rows: Sequence[Sequence[str]]) -> None:
 
 
 def main() -> None:
-    """Measure the commands, print the table, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -24,7 +24,6 @@ COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
-    """Return a competitor's row of the table: counts of verdicts, and the alterations that it did not pass."""
     by_verdict = {
         verdict: [one.alteration for one in findings if one.verdict == verdict]
         for verdict in ("passed", "degraded", "failed")
@@ -34,7 +33,6 @@ def row(name: str, findings: Sequence[Finding]) -> list[str]:
 
 
 def main() -> None:
-    """Run the crash test of all competitors of an environment, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

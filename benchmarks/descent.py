@@ -35,7 +35,7 @@ FEWER = 8
 
 
 def make_episodes(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
-    """Return a function that runs an episode with a gradient step after each window, and the policy."""
+    """Return a function that simulates an episode with a gradient step after each window, and the policy."""
     truncation = run.hyperparameters["truncation"]
     env = TaskVectorEnv(
         run.environment, envs, control=run.control, backend=backend, autoreset_mode="Disabled",
@@ -53,7 +53,6 @@ def make_episodes(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype)
 
 
 def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
-    """Return the gradients of all windows of an episode with a backend, in one vector."""
     fly, policy = make_episodes(run, backend, FEWER, torch.float64)
     found = []
 
@@ -66,7 +65,6 @@ def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
 
 
 def update_times(run: TrainingRun, repeat: int) -> list[float]:
-    """Return the median milliseconds of an update with each backend."""
     prepared = []
     for backend in BACKENDS:
         fly, policy = make_episodes(run, backend, run.envs, torch.float32)

@@ -73,9 +73,8 @@ of the coloured one ``coloured^2 / correlation_time`` is better determined than 
 def read_inertial(file: Path) -> Any:
     """Return rates, rad/s, and specific forces, m/s^2, forward, right and down by time, s since 1970 of GPS time.
 
-    Args:
-        file: text of seven columns, three accelerations, three rates and milliseconds, with the logger's time
-            tags in ``FILE.tag`` beside it.
+    ``file`` has seven columns, three accelerations, three rates and milliseconds; ``FILE.tag`` has the time
+    tags.
 
     Raises:
         ValueError: if either file has another format.
@@ -110,11 +109,9 @@ def read_inertial(file: Path) -> Any:
 
 
 def read_fixes(file: Path) -> Any:
-    """Return positions (degrees, m), velocities north, east, down (m/s) and the quality of an RTKLIB solution by
-    time, s since 1970 of GPS time; quality 1 is fixed, 2 float.
+    """Return an RTKLIB solution's positions (degrees, m), velocities (m/s) and quality by time, s since 1970.
 
-    Raises:
-        ValueError: if the file contains none.
+    Velocities are north, east, down, time is GPS time; quality 1 is fixed, 2 float. An empty file raises ValueError.
     """
     import pandas
 
@@ -136,10 +133,6 @@ def read_fixes(file: Path) -> Any:
 def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
     """Return the INS aligned at the standstill and aided by RTK from there.
 
-    Args:
-        inertial: result of :func:`read_inertial`.
-        fixes: result of :func:`read_fixes`.
-
     Raises:
         ValueError: if the recording does not begin with a standstill of 5 s, or the vehicle does not move after it.
     """
@@ -149,11 +142,6 @@ def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
 
 def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     """Return a drive cut into recordings of LooselyCoupledNavigation.
-
-    Args:
-        inertial: result of :func:`read_inertial`.
-        fixes: result of :func:`read_fixes`, without gaps.
-        seed: seed of the simulated fixes.
 
     Raises:
         ValueError: if positions are missing, or none is left after the alignment.
@@ -182,7 +170,7 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
 def dataset(
     truth: numpy.ndarray, ins: numpy.ndarray, fix: numpy.ndarray, deviation: float, starts: numpy.ndarray
 ) -> xarray.Dataset:
-    """Return recordings as a dataset in the format of recordings' files.
+    """Return a drive's windows as an xarray dataset, in the format of a file of recordings.
 
     Args:
         truth: true positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
@@ -234,8 +222,9 @@ def errors(recorded: xarray.Dataset) -> numpy.ndarray:
 
 
 def ins_error_covariance(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
-    """Return the covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a
-    constant, of an exponentially correlated and of a white rate error.
+    """Return the covariance of the INS position error at times, s, ``(n, n)``, m^2.
+
+    It is the integral of a constant, an exponentially correlated and a white rate error.
     """
     s, t, tau = time[:, None], time, levels["correlation_time"]
     coloured = 2.0 * tau * numpy.minimum(s, t) - tau**2 * (
@@ -256,9 +245,7 @@ def fit_levels(
     The differences are fixes less INS positions. The receiver's noise is included: relevant are the errors that a
     filter can detect through it.
 
-    Args:
-        recorded: result of :func:`recordings`.
-        correlation_time: correlation time, s; None searches the likeliest.
+    ``correlation_time`` is in s; None searches the likeliest.
     """
     from scipy.optimize import minimize
 
@@ -285,7 +272,6 @@ def fit_levels(
 
 
 def report(recorded: xarray.Dataset) -> None:
-    """Print the growth of the recorded INS error over time, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
     covariance = ins_error_covariance(time, PARAMETERS)
@@ -306,7 +292,6 @@ def report(recorded: xarray.Dataset) -> None:
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
-    """Draw the drive with the windows of the INS, and the growth of its error."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -337,7 +322,6 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
 
 
 def main() -> None:
-    """Read a checkout of the data, and write the recordings and the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

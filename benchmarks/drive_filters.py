@@ -60,7 +60,6 @@ def one_axis(drive: Recording, axis: int) -> Recording:
 
 
 def main() -> None:
-    """Evaluate filters and agents on the drive, and print position errors, m, with intervals, lowest first."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("drive", type=Path, help="file of recordings that drive.py wrote")
     drive = filtergym.read_recording(parser.parse_args().drive, ID)

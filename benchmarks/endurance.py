@@ -77,7 +77,6 @@ def endure(
 
 
 def main() -> None:
-    """Run the endurance test of all selected environments, controls and scenarios, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--environment", choices=sorted(catalogue()), help="default: all of them")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of each environment")

@@ -1,11 +1,11 @@
 """Every ranked competitor as C99: compiled, run over recorded episodes, and compared with its own estimates.
 
 A line for each: operations and bytes of state in double; bytes of the source, of code and constants with ``-Os``, and
-of the largest stack of a function; the largest difference to the replay in double and in float, in the standard
-deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM generates
-from the same program (a lane of 512, without a network), and in NumPy for one track. For a competitor that cannot be
-exported the line gives the reason. Times are of processor time, the least of several runs. ``--cross`` names a compiler
-of another processor, with which the files are compiled only, in double and in float.
+of the largest stack of a function; the largest difference to the replay in double and in float, in reported standard
+deviations; nanoseconds an update in C (double and float), in LLVM's code of the same program (a lane of 512, without a
+network), and in NumPy for one track. For a competitor that cannot be exported the line gives the reason. Times are of
+processor time, the least of several runs. ``--cross`` names a compiler of another processor, with which the files are
+compiled only.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -99,7 +99,7 @@ int main(int argc, char **argv) {{
 
 
 class Size(NamedTuple):
-    """Bytes of an exported filter."""
+    """Bytes of an exported filter: source, code, stack, and code of a cross compiler."""
 
     source: int
     code: int
@@ -119,7 +119,6 @@ class Compilers(NamedTuple):
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
-    """Return the bytes of an exported filter, compiled by gcc for size."""
     code = _code_bytes(file, [compilers.own, "-fstack-usage"])
     usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
@@ -139,7 +138,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Run a filter in C over test vectors; return largest difference in deviations, ns an update, writer, size."""
+    """Compile a filter and run it over test vectors; return difference in deviations, ns an update, writer, size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -174,7 +173,6 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Return the nanoseconds of an update in LLVM's code of the same program, a lane of many."""
     program = traced.update
     # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
@@ -196,7 +194,6 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
 
 
 def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
-    """Return the nanoseconds of an update of the competitor in NumPy, for one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
     plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
@@ -228,7 +225,6 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """Yield the figures of each competitor's export by name, or the reason why it cannot be exported."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -275,7 +271,6 @@ COST = (
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """Return two tables in Markdown, a row for each environment: differences; and costs, median and range."""
     accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
     for environment in dict.fromkeys(line["environment"] for line in found):
         own = [line for line in found if line["environment"] == environment]

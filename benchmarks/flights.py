@@ -4,10 +4,10 @@
     python benchmarks/flights.py --out docs/data/flights.csv
 
 The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
-least ``FEWEST`` flights is a set of its own; the other samples of its folder are another one if they have as many
-together, and the rest together is "others". Each sample has its radar in the median of its positions, the radar's noise
-is simulated, and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as
-are those on the ground and those that demonstrate errors.
+least ``FEWEST`` flights is a set of its own; the other samples of its folder are one set if they have as many together,
+else part of "others". Each sample has its radar in the median of its positions, the radar's noise is simulated, and
+scans are 6 s apart. Samples with positions more than ``COARSEST`` seconds apart, on the ground, or that demonstrate
+errors are left out.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def main() -> None:
     competitors = {one.name: one.maker for one in found}
     rows = []
     for smoothing in (SMOOTHING, 0.0):
-        for name, flights in sets(smoothing).items():
+        for name, flights in flight_sets(smoothing).items():
             pieces, _ = flights.flyable(INTERVAL, numpy.inf)
             data = problem.evaluate(
                 competitors, flights, episodes=len(pieces), seed=1, sampling_interval=INTERVAL
@@ -80,7 +80,7 @@ def main() -> None:
     print_tables(table)
 
 
-def sets(smoothing: float) -> dict[str, Flights]:
+def flight_sets(smoothing: float) -> dict[str, Flights]:
     """Return the sets of flights of the package ``traffic`` by name, the largest first."""
     own: dict[str, list] = {}
     rest: dict[str, list] = {}
@@ -107,7 +107,7 @@ def sets(smoothing: float) -> dict[str, Flights]:
 
 
 def _thin_pieces(pieces: list) -> list:
-    """Return the pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
+    """Return the pieces of a set of flights, or every second, third, ... if too long for one scenario."""
     scans = sum(piece.intervals(INTERVAL) for piece in pieces)
     return pieces[:: 1 + int(scans // MOST_SCANS)]
 
@@ -125,7 +125,7 @@ def _rows(own: dict, records: list) -> list[dict]:
 
 
 def print_tables(table: pandas.DataFrame) -> None:
-    """Print the cost of every competitor against the paper's: mean, interval and median, %."""
+    """Print a table for each smoothing: cost of every competitor against the paper's, interval and median, %."""
     for smoothing, part in table.groupby("smoothing", sort=False):
         print(f"\nSmoothed over {smoothing:g} s:\n" if smoothing else "\nAs recorded:\n")
         cells = zip(part.cost, part.low, part.high, part["median"], strict=True)

@@ -17,7 +17,7 @@ import xarray
 
 import filtergym
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.evaluation.running.times import FRONT_MARK, Point, front, longest_equal, time_of, time_text
+from filtergym.evaluation.running.times import FRONT_MARK, Point, front, is_quicker, time_of, time_text
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from filtergym.papers.grid import markdown_table
 
@@ -51,7 +51,6 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
 
 
 def main() -> None:
-    """Evaluate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--environment", choices=CLASSICAL, action="append", help="default: all")
     rows = []
@@ -69,7 +68,6 @@ def main() -> None:
 
 
 def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str]) -> list[list[str]]:
-    """Return the rows of an environment, the quickest competitor first."""
     names = [str(name) for name in results["policy"].values]
     cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
     times = {name: time_of(results.sel(policy=name)) for name in names}
@@ -85,7 +83,7 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
         others = [
             other
             for other in names
-            if (other in learned) != (name in learned) and times[other].nanoseconds <= longest_equal(own)
+            if (other in learned) != (name in learned) and not is_quicker(times[name], times[other])
         ]
         opponent = min(others, key=lambda other: against[other].value, default="")
         rows.append(
@@ -105,7 +103,6 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
 
 
 def percent(found: IntervalEstimate) -> str:
-    """Return a difference and its interval."""
     return f"{100.0 * found.value:+.1f} [{100.0 * found.low:+.1f}, {100.0 * found.high:+.1f}]"
 
 

@@ -3,10 +3,10 @@
 Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 500 --policy bptt
 
 Each agent runs alone and behind the gate (``gated:NAME``), and so does the fallback of that gate, on the test split. A
-cell is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm,
-geometric mean of the episodes' ratios, lies above +2 % as a whole. A track counts as lost where the cost of an episode
-is ten times that of the paper, and above the 99 % quantile of the paper's episodes in that cell. ``--cells`` prints
-every cell.
+cell is a scenario or a stress. Harm is counted where the whole 95 % interval of the cost against the paper's algorithm,
+geometric mean of the episodes' ratios, lies above +2 %. A track counts as lost where the cost of an episode is ten
+times that of the paper, and above the 99 % quantile of the paper's episodes in that cell. ``--cells`` prints every
+cell.
 """
 
 import argparse
@@ -31,7 +31,7 @@ CONSISTENT = (0.5, 2.0)
 
 
 class Cell(NamedTuple):
-    """Result of a competitor in a scenario or under a stress."""
+    """Result of a competitor in a scenario or under a stress: cost ratio, ANEES and lost tracks."""
 
     name: str
     """Name of the scenario or stress."""
@@ -53,7 +53,6 @@ class Cell(NamedTuple):
 
 
 def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield the name of each cell, its scenario and its keywords."""
     for scenario in problem.task.scenarios:
         yield scenario, scenario, {}
     if problem.id in STRESSES:
@@ -62,14 +61,14 @@ def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
             yield f"+{name}", known.scenario, {**known.usual, **keywords}
 
 
-def fly(
+def evaluate_cell(
     problem: Problem,
     makers: dict[str, Any],
     episodes: int,
     split: str,
     cell: tuple[str, str, dict[str, Any]],
 ) -> dict[str, Cell]:
-    """Run competitors in a scenario or under a stress, and return each one's result by name."""
+    """Evaluate competitors in a scenario or under a stress; return the result of each by name."""
     name, scenario, keywords = cell
     run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
     paper, bootstrap = mean_cost(run, problem.baselines.compared_paper), Bootstrap(run.sizes["episode"])
@@ -85,7 +84,6 @@ def fly(
 
 
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
-    """Return the makers of paper's algorithm, gate's fallback, and each agent alone and gated, by name."""
     fallback = problem.baselines.fallback or problem.paper
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}
@@ -97,7 +95,6 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
 
 
 def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
-    """Return a competitor's row of the table: cells harmed, worst cell and its cost, range of ANEES, lost tracks."""
     worst = max(cells, key=lambda cell: cell.ratio[0])
     anees = [cell.anees for cell in cells]
     outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)
@@ -125,7 +122,7 @@ if __name__ == "__main__":
         makers = competitors_of(problem, args.policy or pretrained_agents(problem.id))
         found: dict[str, list[Cell]] = {name: [] for name in makers}
         for cell in cells_of(problem):
-            for name, own in fly(problem, makers, args.episodes, args.split, cell).items():
+            for name, own in evaluate_cell(problem, makers, args.episodes, args.split, cell).items():
                 found[name].append(own)
                 if args.cells:
                     print(

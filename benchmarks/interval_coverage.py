@@ -37,7 +37,7 @@ STATISTICS = ("geometric mean of ratios", "lost tracks", "ratio of means")
 
 
 class Pool(NamedTuple):
-    """Population of episodes."""
+    """Population of episodes: costs of the paper's algorithm and of a competitor, and the cost of a lost track."""
 
     paper: numpy.ndarray
     """Mean cost of the paper's algorithm in every episode, ``(episodes,)``."""
@@ -48,7 +48,6 @@ class Pool(NamedTuple):
 
 
 def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> numpy.ndarray:
-    """Return a competitor's mean cost of every episode of the validation split, ``(episodes,)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
     split = "validation" if problem.task.scenarios[scenario].training else "test"
     experiment = problem.experiment(scenario, episodes, 1, split)
@@ -62,7 +61,6 @@ def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> 
 
 
 def truths(pool: Pool) -> list[float]:
-    """Return the true value of every statistic: that of all episodes, in the order of ``STATISTICS``."""
     ratio = pool.own / pool.paper
     return [
         float(numpy.expm1(numpy.log(ratio).mean())),
@@ -72,7 +70,6 @@ def truths(pool: Pool) -> list[float]:
 
 
 def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
-    """Return the estimate and interval of every statistic from a sample, in the order of ``STATISTICS``."""
     own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [
         bootstrap.geometric_difference(pool.own, pool.paper),
@@ -82,7 +79,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Return, for each statistic, the share of intervals that contain the truth, as text."""
+    """Return for each statistic the share of intervals that hold the truth, and of misses below it, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))

@@ -47,12 +47,11 @@ class Nearest(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Verdict, as text, whether the reference is a limit in this scenario."""
+        """Whether the reference is a limit in this scenario, or which competitors beat it, as text."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
 def names_without_random(problem: Problem) -> list[str]:
-    """Return the names of all ranked competitors, each under its own control, without random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 
@@ -60,8 +59,6 @@ def names_without_random(problem: Problem) -> list[str]:
 def episode_costs(
     problem: Problem, scenario: str, names: Sequence[str], episodes: int, seed: int
 ) -> dict[str, numpy.ndarray]:
-    """Return the mean cost of every episode, ``(episodes,)``, of each competitor by name."""
-
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
@@ -76,15 +73,7 @@ def episode_costs(
 def nearest(
     problem: Problem, scenario: str, episodes: int, seed: int = 1, names: Sequence[str] = ()
 ) -> Nearest:
-    """Return the competitor of least cost in a scenario, compared with the reference.
-
-    Args:
-        problem: the environment.
-        scenario: name of the scenario.
-        episodes: number of episodes of each competitor.
-        seed: number of the experiment.
-        names: names of competitors; empty: all ranked ones.
-    """
+    """Return the competitor of least cost in a scenario, compared with the reference."""
     reference = problem.baselines.score_reference
     costs = episode_costs(
         problem, scenario, [*(names or names_without_random(problem)), reference], episodes, seed

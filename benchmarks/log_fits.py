@@ -1,13 +1,11 @@
-"""Parameters fitted to logs of known true parameters: their errors, the coverage of their intervals, and the gain of
-many starts.
+"""Parameters fitted to logs of known true parameters: their errors, coverage of intervals, gain of many starts.
 
 Targets move by the family's own model: ``constant-velocity`` by white acceleration, constant in every interval;
 ``imm-two`` by two sizes of it, between which a Markov chain switches. Every fourth log is clean, has outliers (3 % of
 the plots, 20 deviations away), is a third as long, or is irregular (intervals between a half and three halves).
 
-The likelihood of an interacting multiple model is an approximation, which merges the histories of modes. Without
-outliers the fitted and the true values of ``imm-two`` are therefore also compared by the likelihood of the target's own
-model, a sum over the likeliest sequences of its modes.
+The likelihood of an interacting multiple model is an approximation, which merges the histories of modes. So without
+outliers fitted and true values of ``imm-two`` are also compared by the likelihood of the target's own model.
 
 Example: python benchmarks/log_fits.py --logs 40 --measurements 300 --family imm-two --starts 20
 """
@@ -78,10 +76,6 @@ def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> f
 
     Each sequence of modes has a Kalman filter; the ``SEQUENCES`` likeliest stay and none are merged. With a ratio of
     one it is that of one Kalman filter.
-
-    Args:
-        recording: recording of one track.
-        values: values of the parameters, in the units of the search.
     """
     quiet, ratio, leave_quiet, leave_noisy, scale = (10.0 ** values[f"log10_{name}"] for name in SEARCHED)
     sizes = numpy.array([quiet, quiet * ratio])

@@ -1,9 +1,8 @@
-"""Filters in a user's loop: equality of bits with a replay, and the time of an update compared with filterpy and Stone
-Soup.
+"""Filters in a user's loop: equality of bits with a replay, and time of an update against filterpy and Stone Soup.
 
-Tracks with scans that missed the target are written as a log. Each is replayed by an evaluation, and passed row by row
-to the running filter, which is saved and restored by pickle in between. Then every filter processes the same plots of
-one track, in rounds of updates in turn; the times are of the processor. A peer that is not installed is left out.
+Tracks with missed scans are written as a log. Each is replayed by an evaluation, and passed row by row to the running
+filter, which is saved and restored by pickle in between. Then every filter processes the same plots of one track, in
+rounds of updates in turn; the times are of the processor. A peer that is not installed is left out.
 
 Example: python benchmarks/online.py --tracks 5 --plots 2000
 """
@@ -35,7 +34,7 @@ T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
 
 
 def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
-    """Write a log of random-walk tracks, and return its rows: track, time, x, y."""
+    """Write a log of random-walk tracks; return its rows of track number, time, x and y."""
     rng = numpy.random.default_rng(0)
     rows = []
     for track in range(tracks):
@@ -78,14 +77,12 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
 
 
 def own_update(name: str, backend: str) -> Callable[[float, float, float], object]:
-    """Return a function that updates a running filter of this package with time, x and y."""
     filter = filtergym.online(ID, name, backend=backend)
     filter.start([2e4, 3e4, 0.0, 0.0], numpy.diag([1e4, 1e4, 600.0, 600.0]))
     return lambda seconds, x, y: filter.update(seconds, x=x, y=y)
 
 
 def own_update_of_two() -> Callable[[float, float, float], object]:
-    """Return a function that updates the running Kalman filter of a user's model with time, x and y."""
     filtergym.state_space(
         "mine/OfTwo-v0", f=[[1, 1.0], [0, 1]], h=[[1, 0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[25.0]],
         mean=[0, 10], covariance=[[100, 0], [0, 25]],
@@ -96,7 +93,6 @@ def own_update_of_two() -> Callable[[float, float, float], object]:
 
 
 def filterpy_update_of_two() -> Callable[[float, float, float], object]:
-    """Return a function that updates filterpy's Kalman filter of the same model with time, x and y."""
     from filterpy.kalman import KalmanFilter
 
     one = KalmanFilter(dim_x=2, dim_z=1)
@@ -136,7 +132,6 @@ def filterpy_update() -> Callable[[float, float, float], object]:
 
 
 def stone_soup_update() -> Callable[[float, float, float], object]:
-    """Return a function that updates Stone Soup's Kalman filter with time, x and y."""
     from datetime import datetime, timedelta
 
     from stonesoup.models.measurement.linear import LinearGaussian

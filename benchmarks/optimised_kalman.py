@@ -5,8 +5,8 @@
     python benchmarks/optimised_kalman.py --kalmannet KalmanNet_TSP
 
 Greenberg, Yannay and Mannor, "Optimization or Architecture: How to Hack Kalman Filtering", NeurIPS 2023. Their package
-fits all entries of Q and R, through Cholesky factors, by descent on the squared error of tracks with truth. It takes
-matrices; where the model is not linear, a subclass of a few lines linearises it as the extended Kalman filter does.
+fits all entries of Q and R, through Cholesky factors, by descent on the squared error of tracks with truth. Where the
+model is not linear, a subclass linearises it as the extended Kalman filter does.
 
 It is trained on simulated episodes of the training split. The resulting Q and R are judged in our Kalman filter, on the
 episodes of all other filters; a check compares the estimates with those of the package's filter. The record is
@@ -42,7 +42,7 @@ NAME = "public_optimised"
 
 
 class Problem(NamedTuple):
-    """A problem of the comparison: model of the filters, prior, and test set."""
+    """A problem of the comparison: model of OKF's filter, prior, and whether its test set is stored."""
 
     name: str
     id: str
@@ -104,7 +104,6 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
 
 
 def make_filter(problem: Problem, folder: str) -> okf.OKF:
-    """Return OKF's untrained filter for a problem."""
     n = len(problem.h)
     options = {
         "H": torch.tensor(problem.h),
@@ -118,7 +117,6 @@ def make_filter(problem: Problem, folder: str) -> okf.OKF:
 
 
 def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the estimates of OKF's filter over tracks of measurements, ``(tracks, T, n)``."""
     found = numpy.empty((*values.shape[:2], model.dim_x))
     with torch.no_grad():
         for track, row in zip(values, found, strict=True):
@@ -131,7 +129,7 @@ def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def optimise(problem: Problem, seed: int) -> dict[str, Any]:
-    """Train OKF's filter, and compare it with ours; return Q, R, seconds and largest difference, by name."""
+    """Train OKF's filter, and compare it with ours; return Q, R, duration and largest difference by name."""
     torch.manual_seed(seed)
     recording = filtergym.record(problem.id, episodes=TRACKS, seed=seed, split="train", horizon=LENGTH)
     assert recording.truth is not None
@@ -151,12 +149,10 @@ def optimise(problem: Problem, seed: int) -> dict[str, Any]:
 
 
 def run_file(folder: Path, problem: Problem, seed: int) -> Path:
-    """Return the path of the file with the result of a training run."""
     return folder / f"{problem.id.replace('/', '.')}.{seed}.json"
 
 
 def main() -> None:
-    """Train all filters, evaluate them on the test episodes, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -3,7 +3,7 @@
 python benchmarks/own_logs.py
 
 The machines and their models are docs/examples/own_logs. A filter that is fitted to one log is evaluated on ten others.
-The limit is our filter with the factors on Q and R of least error on these ten, which are unknown beforehand.
+The limit is our filter with those factors on Q and R that have the least error on these ten.
 """
 
 import argparse
@@ -43,9 +43,7 @@ CANDIDATES = 40
 
 
 def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's estimates from GPS and odometry. Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white
-    acceleration of 2 m/s^2 in a second.
-    """
+    """Return filterpy's positions from GPS (3 m) and odometry (0.2 m/s); Q by hand: acceleration 2 m/s^2."""
     kf, last = KalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([100.0, 100, 25, 25]), []
     columns = ("time", "gps_x", "gps_y", "odometry_x", "odometry_y")
@@ -63,9 +61,7 @@ def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's estimates from a level gauge and a stick. Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate
-    that wanders by 0.02 m/h in an hour, 5 cm of drift a day.
-    """
+    """Return filterpy's levels from gauge (2 cm) and stick (1 cm); by hand: rate 0.02 m/h, drift 5 cm a day."""
     kf, last = KalmanFilter(3, 1), 0.0
     kf.x, kf.P, found = np.array([10.0, 0, 0]), np.diag([0.01, 0.0025, 0.0025]), []
     for t, gauge, stick in zip(log["time"] / 3600, log["gauge"], log["stick"], strict=True):
@@ -83,9 +79,7 @@ def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's estimates of pitch and roll. By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the
-    drone accelerates; innovations wrapped.
-    """
+    """Return filterpy's roll and pitch; by hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad."""
     kf, last = ExtendedKalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([0.01, 0.01, 0.0025, 0.0025]), []
     rows = zip(*(log[n] for n in ("time", "gyro_p", "gyro_q", "roll_angle", "pitch_angle")), strict=True)
@@ -105,9 +99,7 @@ def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def battery(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's estimates of a battery's charge. Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge
-    that wanders by 0.1 % and 1 mV in a minute.
-    """
+    """Return filterpy's charge from current (50 mA) and voltage (10 mV); Q by hand: 0.1 % and 1 mV a minute."""
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
     slope = lambda s: np.array([[0.9 - 1.2 * s[0] + 1.65 * s[0] ** 2, -1.0]])  # noqa: E731
@@ -124,8 +116,9 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def late_vision(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's estimates from late camera fixes. Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix
-    is moved on by the velocity times its delay.
+    """Return filterpy's position from a camera (2 cm) and an accelerometer (0.1 m/s^2).
+
+    A late fix is moved on by the velocity times its delay.
     """
     kf, dt, late = KalmanFilter(3, 1, 1), 0.01, round(LATE / 0.01)
     kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.1, 0.04]), []
@@ -148,7 +141,7 @@ BY_HAND = {one.__name__: one for one in (gps_odometry, level_gauge, pitch_roll, 
 
 
 def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the RMSE of the evaluated components, for every candidate of the factors and episode, ``(C, E)``."""
+    """Return our filter's RMSE for every candidate of the factors on Q and R, and every episode, ``(C, E)``."""
     episodes = len(recording.rows)
     spans = [Span(number, 0, int(rows)) for number, rows in enumerate(recording.rows)]
     windows = cut_windows(recording, task, spans, 0)
@@ -166,8 +159,8 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
     return np.sqrt(total.reshape(count, episodes) / recording.rows)
 
 
-def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
-    """Return the factors on Q and R with the least error on a recording, by name."""
+def least_error_factors(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
+    """Return the factors on Q and R of least error on a recording, by random search, by name."""
     rng, best, width = np.random.default_rng(0), np.zeros(len(names)), 2.0
     for _ in range(3):
         tried = best + width * rng.uniform(-1.0, 1.0, (CANDIDATES, len(names)))
@@ -177,7 +170,7 @@ def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
 
 
 def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[str, float]) -> np.ndarray:
-    """Return our filter's RMSE on each log with late fixes, ``(E,)``."""
+    """Return our filter's RMSE on each log, ``(E,)``, where fixes come late."""
     found = []
     for log in logs:
         seen = np.isfinite(log["camera"])
@@ -189,7 +182,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 
 def processor_time(name: str, folder: Path) -> float:
-    """Return the processor time of the page's three commands (fit, evaluate, export) for a machine, s."""
+    """Return the processor seconds of fit, evaluation and export of a filter for one of the machines."""
     machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", children_time()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
@@ -213,19 +206,16 @@ def processor_time(name: str, folder: Path) -> float:
 
 
 def children_time() -> float:
-    """Return the processor time of all finished child processes, s."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
 
 def problem_id(name: str) -> str:
-    """Return the id of the environment of a machine."""
     module = importlib.import_module(name)
     return next(cls.id for cls in vars(module).values() if hasattr(cls, "definition"))
 
 
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
-    """Return the columns by name of each recording in a CSV file."""
     table = np.genfromtxt(file, delimiter=",", names=True)
     return [
         {name: table[name][table["recording"] == number] for name in table.dtype.names}
@@ -234,7 +224,6 @@ def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
 
 
 def compare(name: str, folder: Path) -> list[list[str]]:
-    """Run all filters on one machine's logs, and return its rows of the table."""
     module = importlib.import_module(name)
     problem = problem_of(problem_id(name))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))
@@ -253,7 +242,7 @@ def compare(name: str, folder: Path) -> list[list[str]]:
     several = {
         "as written": dict.fromkeys(names, 1.0),
         "fitted": fitted,
-        "limit": limit(task, judged, names),
+        "limit": least_error_factors(task, judged, names),
     }
     for who, factors in several.items():
         if name == "late_vision":

@@ -35,7 +35,7 @@ def process_tree(root: int) -> list[int]:
 
 
 def resident_memory(processes: list[int]) -> float:
-    """Return the memory of processes together, GiB; shared memory counts once."""
+    """Return the memory of processes together, GiB, with shared memory counted once."""
     total = 0
     for process in processes:
         try:
@@ -46,7 +46,7 @@ def resident_memory(processes: list[int]) -> float:
     return total / 2**20
 
 
-def filtergym(*words: str) -> tuple[float, float, float]:
+def run_filtergym(*words: str) -> tuple[float, float, float]:
     """Run a ``filtergym`` command; return its seconds, processor seconds, and peak memory of its processes, GiB."""
     began, most = time.monotonic(), 0.0
     command = [sys.executable, "-m", "filtergym", *words]
@@ -63,7 +63,7 @@ def filtergym(*words: str) -> tuple[float, float, float]:
 
 
 def results(folder: Path) -> str:
-    """Return the text of a benchmark's results without its command, which differs between the runs."""
+    """Return the results of a benchmark as text, without its command, which differs between the runs."""
     return (folder / "results.json").read_text(encoding="utf-8").partition("\n")[2]
 
 
@@ -72,7 +72,7 @@ def speed(words: list[str], jobs: int) -> None:
         one, many = Path(folder) / "one", Path(folder) / "many"
         found = {}
         for out, further in ((one, ()), (many, ("--jobs", str(jobs)))):
-            found[out] = filtergym("benchmark", *words, "--out", str(out), *further)
+            found[out] = run_filtergym("benchmark", *words, "--out", str(out), *further)
             seconds, used, _ = found[out]
             print(
                 f"{' '.join(['benchmark', *words, *further])}: {seconds:.0f} s, {used:.0f} s of processors",
@@ -90,7 +90,7 @@ def memory(episodes: int, jobs: int) -> None:
     for name in COMPETITORS:
         words += ["--policy", name]
     with tempfile.TemporaryDirectory() as folder:
-        seconds, _, largest = filtergym(*words, "--out", folder)
+        seconds, _, largest = run_filtergym(*words, "--out", folder)
     print(f"{episodes} episodes, {len(COMPETITORS)} competitors, {jobs} processes: {seconds:.0f} s, "
           f"most memory of all together {largest:.2f} GiB")  # fmt: skip
 
@@ -103,7 +103,7 @@ def command_of(process: int) -> str:
 
 
 def kill_nodes(words: list[str]) -> None:
-    """Run a command on a cluster of two nodes, and kill a worker, then a node, after some results."""
+    """Evaluate on a cluster of two nodes, and kill a worker, then a node; print whether the records are the same."""
     import ray
     from ray.cluster_utils import Cluster
 

@@ -2,10 +2,9 @@
 
     python benchmarks/parity.py [--environment ID] [--episodes N]
 
-Both backends run the same episodes with the same random actions. The differences are of rounding: functions of the
-vector library, sums in another order, products with a constant zero that are left out. They grow where a filter is
-unstable or decides by a threshold. The table shows the largest differences of an observation and of a reward over all
-episodes and steps, ``|compiled - numpy| / (1 + |numpy|)``, and the median over the episodes of their largest.
+Both backends run the same episodes with the same random actions. The differences are of rounding, and grow where a
+filter is unstable or decides by a threshold. The table shows the largest differences of an observation and of a reward
+over all episodes and steps, ``|compiled - numpy| / (1 + |numpy|)``, and the median over the episodes of their largest.
 """
 
 import argparse
@@ -32,15 +31,6 @@ class Parity(NamedTuple):
 
 
 def parity(id: str, control: str, scenario: str, episodes: int, decisions: int | None = None) -> Parity:
-    """Run episodes on both backends with the same actions, and return the largest differences.
-
-    Args:
-        id: Gymnasium id.
-        control: control of the random actions.
-        scenario: name of the scenario.
-        episodes: number of episodes, side by side.
-        decisions: number of decisions of each episode; default: whole episodes.
-    """
     envs = [
         gymnasium.make_vec(
             id,
@@ -72,7 +62,6 @@ def _difference(one: numpy.ndarray, other: numpy.ndarray) -> numpy.ndarray:
 
 
 def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
-    """Yield the differences between backends of every control in every scenario of some environments."""
     for id in ids:
         for control in catalogue()[id].controls:
             for scenario in catalogue()[id].scenarios:
@@ -80,7 +69,6 @@ def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
 
 
 def main() -> None:
-    """Read the command line, run all comparisons, and print the table."""
     parser = argparse.ArgumentParser(description="Compiled steps against NumPy.")
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
     parser.add_argument("--episodes", type=int, default=64, help="side by side (default 64)")

@@ -62,7 +62,6 @@ def arguments() -> argparse.Namespace:
 
 
 def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
-    """Train an agent once; return its costs with those of the paper's algorithm and of the action zero."""
     import torch
 
     from filtergym.agents import to_sb3
@@ -112,7 +111,6 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
 
 
 def table(runs: list[dict]) -> Table:
-    """Return a table of cost differences: mean over the seeds with Student's interval, and every seed."""
     from scipy.stats import t
 
     title = "Stable-Baselines3, its defaults and ours: cost against the paper, %"

@@ -85,7 +85,7 @@ INTERVAL = 0.02
 
 
 def taylor(x: Any, order: int) -> list[Any]:
-    """Return KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
+    """Return KalmanNet's Lorenz transition: the Taylor series of ``exp(A(x) T)`` to some order, times the state."""
     answer, term = list(x), list(x)
     for j in range(1, order + 1):
         term = [entry * (INTERVAL / j) for entry in _product(x, term)]
@@ -99,7 +99,7 @@ def _product(x: Any, y: Sequence[Any]) -> list[Any]:
 
 
 def flow(x: Any, steps: int = 4) -> list[Any]:
-    """Return the Lorenz attractor's state after an interval, by the Runge-Kutta method of fourth order."""
+    """Return the Lorenz attractor's state after an interval, by fourth-order Runge-Kutta steps."""
     T, state = INTERVAL / steps, list(x)
 
     def ahead(slope: Sequence[Any], share: float) -> list[Any]:
@@ -116,12 +116,12 @@ def flow(x: Any, steps: int = 4) -> list[Any]:
 
 
 def order_five(x: Any) -> list[Any]:
-    """Return the state after an interval by the series of order five: the simulation's transition."""
+    """Return the state after an interval by the series of order five, as in the simulation."""
     return taylor(x, 5)
 
 
 def order_two(x: Any) -> list[Any]:
-    """Return the state after an interval by the series of order two: a filter's approximate transition."""
+    """Return the state after an interval by the series of order two, a filter's approximation."""
     return taylor(x, 2)
 
 
@@ -210,13 +210,7 @@ STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
 
 
 class WithNoises(Extended):
-    """The Kalman filter with constant Q and R in place of the model's.
-
-    Args:
-        task: the problem.
-        Q: covariance of the process noise, ``(n, n)``.
-        R: covariance of the measurement noise, ``(m, m)``.
-    """
+    """The Kalman filter with constant Q and R in place of the model's."""
 
     def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
         super().__init__(task)
@@ -232,7 +226,7 @@ class WithNoises(Extended):
 
 
 def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
-    """Return the maker of a Kalman filter with constant Q and R."""
+    """Return a factory of Kalman filters with constant Q and R."""
 
     def make(task: Any) -> WithNoises:
         return WithNoises(task, Q, R)
@@ -245,14 +239,13 @@ def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
 
 
 def read_tensors(file: Path) -> Any:
-    """Return the tensors of a stored data set, loaded without executing code."""
     import torch
 
     return torch.load(file, weights_only=True, map_location="cpu")
 
 
 def stored_linear(folder: Path, id: str) -> Recording:
-    """Return KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
+    """Return KalmanNet's stored test set of the linear problem as a recording: 200 tracks of 100 measurements."""
     stored = read_tensors(folder / "Simulations/Linear_canonical/data/2x2_rq020_T100.pt")
     z, truth = (part.double().numpy().swapaxes(1, 2) for part in stored[4:6])
     episodes, times, _ = z.shape
@@ -272,10 +265,6 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
     """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone.
 
     Where the receiver has no fix, its last position is used.
-
-    Args:
-        folder: folder of the repository.
-        name: name of the set, ``test`` or ``val``.
     """
     drives = [
         {key: value.numpy() if hasattr(value, "numpy") else value for key, value in one.items()}
@@ -339,7 +328,6 @@ class Row(NamedTuple):
 
 
 def decibels(values: Any) -> Any:
-    """Return values in decibels, ``10 log10(values)``."""
     return 10.0 * numpy.log10(values)
 
 
@@ -355,7 +343,6 @@ def tune_scales(id: str, name: str, runs: Path) -> Any:
 
 
 def train(id: str, algorithm: str, steps: int, seed: int, runs: Path) -> str:
-    """Train an agent on training episodes, unless ``runs`` contains it; return its folder."""
     folder = runs / f"{short_name(id)}.{algorithm}.{seed}"
     if not (folder / "best").exists():
         words = ["train", f"{MODULE}:{id}", "--algo", algorithm, "--steps", str(steps), "--seed", str(seed)]
@@ -409,7 +396,7 @@ def judge(
 
 
 class Problem(NamedTuple):
-    """A problem of state-space models, and its test set."""
+    """A problem of a state-space model: scales of Q to try, and its stored test set, if any."""
 
     name: str
     id: str
@@ -420,13 +407,7 @@ class Problem(NamedTuple):
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Return the makers of a problem's filters by name: the model's own, tuned and trained.
-
-    Args:
-        problem: problem of the filters.
-        agents: folders of the runs of each algorithm.
-        runs: folder of the tuned values.
-    """
+    """Return the filters of a problem by name: the model's own, tuned and trained."""
     known = problem_of(problem.id).baselines
     untuned = ["extended", *(name for name in ("unscented", "kalman-imm") if name in known.estimators)]
     competitors: dict[str, Any] = {name: name for name in (*untuned, "covariance-matching")}
@@ -439,7 +420,6 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Return the factors on R and Q with the least squared error over the validation drives, by name."""
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:
@@ -503,7 +483,6 @@ def _text(value: float, digits: int) -> str:
 
 
 def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns and rows of the table of the problems of state-space models."""
     rows = []
     if "noise_floor_db" in figures:
         floor = _text(figures["noise_floor_db"], 3)
@@ -526,7 +505,6 @@ def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns and rows of the table of drives, published results first."""
     rows = [["published", name, *(_text(v, 2) for v in values), "", ""] for name, values in PUBLISHED.items()]
     for one in figures["drives"]:
         anees = ", ".join(_text(one["anees"][date], 1) for date in DATES) if "anees" in one else ""
@@ -536,7 +514,6 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
-    """Write the records ``public_problems`` and ``public_drives`` from all results."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = {
         PROBLEMS: (problem_table, "noise_floor_db", "rows"),
@@ -552,7 +529,6 @@ def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECOR
 
 
 def main() -> None:
-    """Tune, train and evaluate all filters, and write the records."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class Stresses(NamedTuple):
-    """Stresses of one environment."""
+    """Stresses of one environment: parameters outside its training, by name of the stress."""
 
     scenario: str
     """Scenario without faults."""

@@ -18,9 +18,9 @@ Sections, all of them by default:
     Time and peak memory of processes that evaluate one, two and four times as many episodes, competitors and
     measurements, and step as many environments.
 
-One thread. Times are of the processor: other processes on the machine do not count, but they affect its caches, so use
-ratios. A figure is the median over rounds. Two versions are compared by running this file with the Python of each at
-the same time, and by dividing the figures in the files that ``--json`` writes.
+One thread. A figure is the median over rounds of processor time, which other processes affect through caches: use
+ratios. Two versions are compared by running this file with the Python of each at the same time, and by dividing the
+figures in the files that ``--json`` writes.
 """
 
 import argparse
@@ -64,7 +64,6 @@ Record = dict[str, Any]
 
 
 def processor_seconds(call: Callable[[], object]) -> float:
-    """Return the processor time of a call, s."""
     begin = time.process_time()
     call()
     return time.process_time() - begin
@@ -105,7 +104,6 @@ def step_seconds(env: Any, share: float) -> float:
 
 
 def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iterator[Record]:
-    """Yield the measured speed of environments' steps with default options."""
     for id in [*ids, PEER]:
         interval = make_model(catalogue()[id]).task.decision_interval if id in catalogue() else 1
         row: Record = {"environment": id.removeprefix("filtergym/")}
@@ -121,10 +119,7 @@ def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iter
 
 
 class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A single environment that resets automatically at the end of an episode."""
-
     def step(self, action: Any) -> Any:
-        """Return the result of a step, and reset the environment at the end of the episode."""
         answer = self.env.step(action)
         if answer[2] or answer[3]:
             self.env.reset()
@@ -135,7 +130,7 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def compiled_costs() -> tuple[float, float]:
-    """Return the seconds of an addition or product, and of an exponential, in compiled code."""
+    """Return the seconds of an arithmetic operation, and of an exponential, in compiled code."""
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -176,7 +171,6 @@ def floor_seconds(model: Any) -> float:
 
 
 def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
-    """Yield the measured speed of a step in compiled code, NumPy, JAX and filterpy."""
     try:
         import jax  # noqa: F401
         import peer_jax
@@ -207,7 +201,6 @@ def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Re
 
 
 def measure_evaluations(id: str, episodes: int, share: float) -> Iterator[Record]:
-    """Yield the measured time of evaluations of competitors one by one, then of all together."""
     horizon = make_model(catalogue()[id]).task.horizon
     few = min(episodes, EPISODES)
     for name in COMPETITORS:
@@ -249,7 +242,6 @@ def run_apart(code: str) -> tuple[float, float]:
 
 
 def measure_scaling(id: str) -> Iterator[Record]:
-    """Yield time and memory with one, two and four times as many episodes, competitors and environments."""
     names = [name for name in COMPETITORS if name != "bptt"][:8]
     usual: Record = {"id": id, "names": names[:2], "episodes": 2000, "horizon": 100}
     kinds: dict[str, Callable[[int], str]] = {
@@ -266,7 +258,6 @@ def measure_scaling(id: str) -> Iterator[Record]:
 
 
 def show(title: str, rows: Iterator[Record], records: dict[str, list[Record]]) -> None:
-    """Collect the rows of a section and print them as a Markdown table."""
     records[title] = []
     for row in rows:
         records[title].append(row)
@@ -284,7 +275,6 @@ def _cell(value: Any) -> str:
 
 
 def main() -> None:
-    """Read the command line, measure its sections, and print the tables."""
     sections = ("environments", "steps", "evaluations", "scaling")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

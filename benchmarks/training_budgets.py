@@ -2,10 +2,9 @@
 
     python benchmarks/training_budgets.py --runs runs/budgets
 
-Each is a separate run with the settings of ``filtergym train``, whose learning rate falls over its own length; runs in
-the folder are not repeated. TightlyCoupledNavigation is left out: there a decision takes ten measurements of three
-filters, and the shipped runs have 100,000 of them. The best agent of each run is evaluated on the episodes of the test
-split.
+Each is a separate run of ``filtergym train``, whose learning rate falls over its own length; runs in the folder are not
+repeated. TightlyCoupledNavigation is left out: its decisions take ten measurements of three filters, and its shipped
+runs have 100,000 of them. The best agent of each run is evaluated on the episodes of the test split.
 """
 
 import argparse
@@ -24,7 +23,6 @@ BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
 def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
-    """Train one run for each seed, unless it is finished, and return the runs' folders."""
     words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
     command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
@@ -32,7 +30,6 @@ def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
 
 
 def main() -> None:
-    """Train agents with each budget, evaluate them on test episodes, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs/budgets"), help="folder of the runs")
     parser.add_argument("--algo", default="bptt")

@@ -29,14 +29,6 @@ HEADER = ("environment", "scenario", "opponent", "less the opponent, %", "runs, 
 
 
 def rows_of(id: str, agents: list[str], opponents: list[str], episodes: int) -> Iterator[list[str]]:
-    """Yield the rows of the table of an environment.
-
-    Args:
-        id: its Gymnasium id.
-        agents: paths of the agents.
-        opponents: names of competitors; those that the environment does not have are left out.
-        episodes: number of episodes of a scenario.
-    """
     problem = problem_of(id)
     known = [name for name in opponents if name in shipped_names(problem)]
     bootstrap = Bootstrap(episodes)
@@ -62,7 +54,6 @@ def rows_of(id: str, agents: list[str], opponents: list[str], episodes: int) -> 
 
 
 def main() -> None:
-    """Evaluate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of training runs")
     parser.add_argument("--against", action="append", required=True, help="opponent; repeatable")

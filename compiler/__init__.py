@@ -1,12 +1,12 @@
 """Small compiler for functions of arrays: it traces a function once and runs it as vectorised machine code.
 
-A function written for NumPy or torch through the array API standard does the same arithmetic for each of N independent
-lanes (entries of the last axis of all its arrays). On small arrays nearly all the time is spent in calls of the array
-library. A run on symbols (:mod:`.namespace`) records the arithmetic of one lane, a straight line without branches
-(:mod:`.program`). It is emitted as LLVM code that computes a block of lanes at a time (:mod:`.emission`). A long
-program is emitted as loops over its array operations (:mod:`.rolling`, :mod:`.loop_emission`). The code is translated
-for the current processor and cached for later processes (:mod:`.native`, :mod:`.cache`). Exponentials and similar
-functions come from a vector library that is chosen at run time (:mod:`.library`).
+A function written for NumPy or torch through the array API standard does the same arithmetic for each of N
+independent lanes (entries of the last axis of all its arrays). On small arrays nearly all the time is spent
+in calls of the array library. A run on symbols (:mod:`.namespace`) records the arithmetic of one lane as a
+straight line without branches (:mod:`.program`), which is emitted as LLVM code for a block of lanes at a time
+(:mod:`.emission`), if long as loops over its array operations (:mod:`.rolling`, :mod:`.loop_emission`). The
+code is translated for the current processor and cached for later processes (:mod:`.native`, :mod:`.cache`).
+Exponentials and similar functions come from a vector library that is chosen at run time (:mod:`.library`).
 
 The compiler is independent of the purpose of the functions. A function that cannot be traced (a branch that depends on
 the numbers, a function that the namespace lacks) raises :class:`~.namespace.NotTraceable`.

@@ -11,7 +11,7 @@ LANES = 8
 
 
 class LaneBlock:
-    """Block of adjacent lanes: a vector of numbers in LLVM.
+    """Block of adjacent lanes that one instruction computes: LLVM types and constants of such a vector.
 
     Args:
         lanes: number of lanes, a divisor of ``LANES``.
@@ -39,7 +39,7 @@ class LaneBlock:
         return "<" + ", ".join([f"{kind} {value}"] * self.lanes) + ">"
 
     def repeat(self, one: str, kind: str) -> str:
-        """Return the LLVM instruction that copies the first lane of a value to every lane."""
+        """Return the LLVM instruction that copies the value in the first lane to every lane."""
         return f"shufflevector {kind} {one}, {kind} poison, <{self.lanes} x i32> zeroinitializer"
 
     def intrinsic(self, name: str) -> str:
@@ -54,15 +54,11 @@ class LaneBlock:
 
 @functools.cache
 def block_for(features: str) -> LaneBlock:
-    """Return the block that fills one register of a processor: eight lanes with AVX-512, else four.
-
-    Args:
-        features: features of the processor in LLVM's form, ``+avx2,-avx512f,...``.
-    """
+    """Return the :class:`LaneBlock` for a processor with these LLVM features: 8 lanes with AVX-512, else 4."""
     return block_of(LANES if "+avx512f" in features.split(",") else LANES // 2)
 
 
 @functools.cache
 def block_of(lanes: int) -> LaneBlock:
-    """Return the block with this number of lanes."""
+    """Return the :class:`LaneBlock` of this number of lanes."""
     return LaneBlock(lanes)

@@ -39,14 +39,10 @@ class Loops:
     """Writer of a program's loops as C text.
 
     Args:
-        program: the program in loops.
         name: prefix of the names of tables.
         read: function from argument and row to the C expression of an input.
         write: function from argument and row to the C expression of a destination.
-        arrays: pointers and offsets of these rows.
-        scalar: floating-point type.
         tables: names of the tables of ``take`` by their index in the constants.
-        qualifier: qualifier of tables.
     """
 
     def __init__(
@@ -75,7 +71,7 @@ class Loops:
         self._starts: dict[tuple[int, ...], str] = {}
 
     def loop(self, loop: Loop) -> list[str]:
-        """Return the C lines of a loop, after a comment with the functions of its operations if it is new."""
+        """Return the C lines of a loop; a comment names the functions of its operations if they are new."""
         first, *rest = self._lines(loop)
         callers = dict.fromkeys(self.program.callers.get(statement.origin, "") for statement in loop.body)
         names = [caller for caller in callers if caller]
@@ -87,7 +83,6 @@ class Loops:
         return [first, *rest]
 
     def _lines(self, loop: Loop) -> list[str]:
-        """Return the C lines of a loop: one, or rows and columns, or runs of members with constant distances."""
         self._choose_form(loop)
         lines = []
         for number, operation, operands, logical, table, kept, _ in loop.body:
@@ -120,7 +115,6 @@ class Loops:
         return [*head, *(f"    {line}" for line in lines), "}"]
 
     def _in_runs(self, lines: list[str], turns: int, uses_k: bool) -> list[str]:
-        """Return the C lines of a loop over runs with an inner loop over the members of a run."""
         lengths = [end - start for start, end in pairwise([*self._runs, turns])]
         begin, on = [], ["--n", *["++k"] * uses_k]
         for places, name in self._starts.items():
@@ -138,14 +132,12 @@ class Loops:
         ]
 
     def _entry(self, numbers: Sequence[int]) -> str:
-        """Return a C expression in ``i`` for the number of run ``i``."""
         if common_difference(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")
         return " + ".join([str(least)] * (least != 0 or not text) + [text] * (text != ""))
 
     def _choose_form(self, loop: Loop) -> None:
-        """Select the form of a loop with the shortest tables: one loop, rows and columns, or runs."""
         self._columns, self._runs, self._starts = 1, [0], {}
         irregular = set()
         for statement in loop.body:
@@ -196,7 +188,6 @@ class Loops:
         return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
 
     def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
-        """Return the C expression of a member of an array in one turn of the loop."""
         array, places = operand.array, operand.places
         if array != SCRATCH and len(set(places)) == 1:
             return single(array, places[0])
@@ -204,14 +195,12 @@ class Loops:
         return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
 
     def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
-        """Return the offsets of an operand's members from the pointer to their array."""
         if operand.array == SCRATCH:
             return operand.places
         of_row = rows[operand.array].places
         return tuple(of_row[row] for row in operand.places)
 
     def _index(self, places: tuple[int, ...]) -> str:
-        """Return the C expression of the offset of member ``k``, in row ``i`` and column ``j``."""
         if len(self._runs) > 1 and common_difference(places) is None:
             name = self._starts.setdefault(_distances(places), f"r{len(self._starts)}")
             return f"{min(places)} + {name}" if min(places) else name
@@ -222,7 +211,7 @@ class Loops:
         return " + ".join([str(first)] * (first != 0) + [text for _, text in terms if text]) or "0"
 
     def _term(self, places: Sequence[int], letter: str) -> tuple[int, str]:
-        """Return the least of some offsets, and the C expression of the distance of the others from it."""
+        """Return the smallest offset, and the C expression of the others' distance from it by the loop variable."""
         step, least = common_difference(places), min(places)
         if step is None:
             return least, f"{self._table(_distances(places))}[{letter}]"
@@ -231,7 +220,6 @@ class Loops:
         return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
 
     def _table(self, values: tuple[Any, ...]) -> str:
-        """Return the name of a C constant array of numbers or of distances; define it at first use."""
         key = (type(values[0]), *(struct.pack("d", value) for value in values))
         if key not in self._found:
             name = self._found[key] = (
@@ -247,7 +235,7 @@ class Loops:
 
 
 def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
-    """Return row and column offsets whose sums are all given offsets, row by row; None if there are none."""
+    """Return row and column offsets that sum to the given offsets, row by row; None if there are none."""
     if columns == 1:
         return None
     rows, row = tuple(places[::columns]), tuple(place - places[0] for place in places[:columns])
@@ -261,7 +249,6 @@ def _distances(places: Sequence[int]) -> tuple[int, ...]:
 
 
 def _kind(numbers: Sequence[int]) -> str:
-    """Return the shortest C integer type for some numbers."""
     for size, kind in ((8, "char"), (16, "short")):
         if min(numbers) >= 0 and max(numbers) < 2**size:
             return f"unsigned {kind}"
@@ -271,14 +258,13 @@ def _kind(numbers: Sequence[int]) -> str:
 
 
 def _bytes(numbers: Sequence[int]) -> int:
-    """Return the size of a table in bytes, zero where its entries have constant distances."""
     if common_difference(numbers) is not None:
         return 0
     return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)
 
 
 def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
-    """Return the first members of runs in which every table's entries have constant distances."""
+    """Return the starts of runs of loop turns in which the entries of every table have constant distances."""
     apart = numpy.diff(numpy.array(list(tables)), axis=1)
     bends = (apart[:, 1:] != apart[:, :-1]).any(axis=0).tolist()
     starts = [0]
@@ -290,7 +276,7 @@ def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
 
 
 def _steps(places: Sequence[int], runs: Sequence[int], turns: int) -> list[int]:
-    """Return the distance between members in every run; for a run of one member that of the previous run."""
+    """Return the distance between entries in every run; a run of one entry takes that of the previous run."""
     steps: list[int] = []
     for start, end in pairwise([*runs, turns]):
         alone = steps[-1] if steps else 1

@@ -1,9 +1,8 @@
 """C99 text of a program for one lane, in double or float; the statements also form a CUDA kernel.
 
 Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`). Numbers that pass from one static
-function or loop to the next are stored in a scratch array ``w``. Comparisons with NaN, and the results of ``maximum``,
-``minimum``, ``sign``, ``remainder`` and ``take`` for NaN, are those of :mod:`.emission`; of the two zeros a ``maximum``
-may return either.
+function or loop to the next are stored in a scratch array ``w``. Results for NaN are those of :mod:`.emission`; of the
+two zeros a ``maximum`` may return either.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -37,7 +36,7 @@ twice as fast.
 
 
 class ProgramSource(NamedTuple):
-    """C text of a program."""
+    """C text of a program: static functions, statements, and what they need."""
 
     functions: str
     """Tables and static functions, to be placed before the function."""
@@ -85,8 +84,6 @@ def helper_functions(
 
 
 class _ProgramText:
-    """Writer of a program's statements as C text; values are named by their steps."""
-
     def __init__(
         self,
         program: StraightLineProgram,
@@ -110,7 +107,7 @@ class _ProgramText:
         return f"v{step}"
 
     def as_number(self, step: int) -> str:
-        """Return the C expression of a step's value as a number, one for true and zero for false."""
+        """Return the C expression of a value as a number: one for true, zero for false."""
         value = self.value(step)
         if not self.steps[step].logical:
             return value
@@ -140,21 +137,13 @@ def write_program(
     results: int = 0,
     arrays: Arrays | None = None,
 ) -> ProgramSource:
-    """Return the C text of a program for one lane, with loops where they are shorter.
+    """Return the C text of a program for one lane, with loops where they make the text shorter.
 
-    A result is written as soon as it is computed, so results must not overwrite inputs.
-
-    Args:
-        program: the program.
-        name: name of the function that contains the statements, and prefix of the static functions.
-        parameters: parameters of that function and of all static functions.
-        read: function from argument and row to the C expression of an input.
-        write: function from argument and row to the C expression of a destination; ``""``: no destination.
-        scalar: floating-point type.
-        qualifier: qualifier of static functions.
-        between: statements after the first results, before any other input is read.
-        results: number of these results.
-        arrays: pointers and offsets of the rows of all arguments, for loops; default: no loops.
+    A result is written as soon as it is computed, so results must not overwrite inputs. ``read`` and ``write`` are
+    functions from argument and row to a C expression; no result is written to ``""``. ``name`` is that of the
+    function, and prefix of the static functions that it calls. ``between`` are statements after the first ``results``
+    results, before any other input is read. Without ``arrays``, the pointers and offsets of all arguments, there are
+    no loops.
     """
     if "product" in program.steps.operations:
         raise ValueError("a product that is a loop cannot be written in C: trace it with Graph(loops=False)")
@@ -203,7 +192,6 @@ def write_program(
 
 
 def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Return the blocks of statements merged up to the length of a function, and their number before a pause."""
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):
@@ -250,16 +238,9 @@ def write_lanes(
 ) -> str:
     """Return the C text of a function that runs a program over lanes, in double; or a CUDA kernel.
 
-    The kernel has a thread for each lane.
-
     The function takes ``a``, the addresses of the arrays, ``stride``, the distance from row to row of each, and the
-    lanes ``first`` to ``last``; the kernel takes ``a``, ``stride`` and the number of lanes.
-
-    Args:
-        program: the program.
-        name: name of the function.
-        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        cuda: write CUDA instead of C.
+    lanes ``first`` to ``last``; the kernel, which has a thread for each lane, takes ``a``, ``stride`` and the number
+    of lanes. An argument that is ``lane_first`` has layout ``(N, rows)``, else ``(rows, N)``.
     """
 
     def place(argument: int, row: int) -> str:

@@ -45,7 +45,7 @@ _RESERVED = frozenset(
 
 @dataclass(frozen=True)
 class Scalar:
-    """A floating-point type of C."""
+    """Floating-point type of C, double or float: name, suffix and limits."""
 
     name: str
     suffix: str
@@ -61,7 +61,7 @@ FLOAT = Scalar("float", "f", numpy.float32, "FLT_MAX", "FLT_MIN")
 
 
 class Parameter(NamedTuple):
-    """A parameter of a C function."""
+    """Type and name of a parameter of a C function."""
 
     type: str
     """C text before the name."""
@@ -69,12 +69,7 @@ class Parameter(NamedTuple):
 
 
 def identifier(text: str, used_names: Collection[str] = ()) -> str:
-    """Return a valid C identifier for a text, different from reserved names and those in use.
-
-    Args:
-        text: any text.
-        used_names: names that are already in use.
-    """
+    """Return a valid C identifier made from a text, different from reserved names and those in use."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60] or "x"
     if not name[0].isalpha():
@@ -89,7 +84,7 @@ def identifier(text: str, used_names: Collection[str] = ()) -> str:
 
 
 def plain_words(text: str) -> str:
-    """Return a text as one line of printable ASCII without begin or end of a C comment."""
+    """Return a text as one line of printable ASCII without the delimiters of C comments."""
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "replace").decode()
     line = " ".join("".join(c if c.isprintable() else " " for c in ascii_text).split()).replace("\\", "|")
     # No end, no begin, and no trigraph.
@@ -97,12 +92,7 @@ def plain_words(text: str) -> str:
 
 
 def comment(*paragraphs: str, indent: str = "") -> str:
-    """Return a C comment with a paragraph for each text; leading blanks of a text are preserved.
-
-    Args:
-        *paragraphs: any texts.
-        indent: blanks before every line.
-    """
+    """Return a C comment with one paragraph for each text, every line indented; leading blanks are preserved."""
     lines: list[str] = []
     for text in paragraphs:
         before = " " * (len(text) - len(text.lstrip(" ")))
@@ -130,7 +120,7 @@ def literal(value: float, scalar: Scalar = DOUBLE) -> str:
 
 
 def is_beyond(value: float, scalar: Scalar) -> bool:
-    """Return whether a finite number is beyond the range of normal numbers of ``float``; False for ``double``."""
+    """Return whether a finite number is out of the range of normal numbers of ``float``; False for ``double``."""
     limits = numpy.finfo(scalar.dtype)
     size = abs(value)
     return scalar.dtype is not numpy.float64 and (
@@ -161,14 +151,9 @@ def expression(
     scalar: Scalar,
     table: tuple[str, int] | None = None,
 ) -> str:
-    """Return the C expression of an operation.
+    """Return the C expression of one arithmetic operation on the C expressions of its arguments.
 
-    Args:
-        operation: operation of a step.
-        values: C expressions of its arguments.
-        known: whether each argument is a constant.
-        scalar: floating-point type.
-        table: for ``take``, name and length of its table.
+    ``known`` states whether each argument is a constant; ``table`` are name and length of the table of ``take``.
     """
     if table is not None:
         return f"{table[0]}[place_of({values[0]}, {table[1]})]"
@@ -192,7 +177,7 @@ def expression(
 
 
 def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
-    """Return the C expression of the larger or smaller of two numbers, NaN if one of them is NaN."""
+    """Return the C expression of the maximum or minimum of two numbers, NaN if either is NaN."""
     one, other = values if known[0] or not known[1] else values[::-1]
     # A constant is never NaN, see Graph.
     unordered = "" if any(known) else f" || {one} != {one}"
@@ -200,7 +185,7 @@ def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
 
 
 def function_text(returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]) -> str:
-    """Return the C definition of a function; unused parameters are cast to void."""
+    """Return the C definition of a function; parameters that its body does not use are cast to void."""
     listed = ", ".join(_declare(parameter) for parameter in parameters)
     words = set(re.findall(r"\w+", "\n".join(body)))
     unused = [f"(void){parameter.name};" for parameter in parameters if parameter.name not in words]

@@ -1,12 +1,12 @@
 """Cache of compiled machine code in the user's cache folder, by content.
 
 An entry is written to a temporary file and moved into place, begins with its own checksum, and is ignored if it is
-invalid. The size of the folder is limited: the least recently used entries are removed first. If the operating system
-refuses an access, the entry is treated as missing.
+invalid. The least recently used entries are removed first where the folder is too large. If the operating system
+refuses an access, the entry counts as missing.
 
-An entry is executed. So it is used, like a key of ssh, only if no other user can have written it: folder and entry
-belong to this user or to root, and neither group nor others may write to them. The checks use the opened file itself,
-so that it cannot be exchanged in between.
+An entry is executed. So, like a key of ssh, it must be safe from other users: folder and entry belong to this
+user or to root, and neither group nor others may write to them. The checks use the opened file itself, so
+that it cannot be exchanged in between.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ SWITCH = "FILTERGYM_COMPILER_CACHE"
 
 
 def folder() -> Path | None:
-    """Return the path of the cache folder; None if the cache is off."""
+    """Return the path of the cache folder of compiled code; None if the cache is off."""
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off":
         return None
@@ -43,7 +43,7 @@ def folder() -> Path | None:
 
 
 def key(*texts: str) -> str:
-    """Return the name of an entry: a SHA-256 digest of some texts."""
+    """Return the name of a cache entry: the SHA-256 digest of some texts."""
     digest = hashlib.sha256()
     for text in texts:
         digest.update(f"{len(text)}:{text}".encode())
@@ -51,7 +51,7 @@ def key(*texts: str) -> str:
 
 
 def load(name: str) -> bytes | None:
-    """Return the machine code of an entry; None if it is missing or invalid."""
+    """Return the machine code in a cache entry; None if the entry is missing or invalid."""
     place = folder()
     if place is None:
         return None
@@ -67,13 +67,13 @@ def load(name: str) -> bytes | None:
 
 
 def contains(name: str) -> bool:
-    """Return whether an entry's file exists, valid or not."""
+    """Return whether the file of a cache entry exists, valid or not."""
     place = folder()
     return place is not None and (place / f"{name}{SUFFIX}").exists()
 
 
 def store(name: str, code: bytes) -> None:
-    """Write machine code as an entry; errors of the operating system are ignored."""
+    """Write machine code as a cache entry; errors of the operating system are ignored."""
     place = folder()
     if place is None:
         return
@@ -108,7 +108,6 @@ _REPORTED_FOLDERS: set[Path] = set()
 
 
 def _explain(place: Path, reason: _Untrusted) -> None:
-    """Warn once that a folder, or an entry in it, is not used, with the reason."""
     if place not in _REPORTED_FOLDERS:
         _REPORTED_FOLDERS.add(place)
         warnings.warn(
@@ -119,12 +118,7 @@ def _explain(place: Path, reason: _Untrusted) -> None:
 
 
 def _read(place: Path, name: str) -> bytes:
-    """Return the content of an entry and update its time of use.
-
-    Raises:
-        _Untrusted: if another user can have written it.
-        OSError: if it does not exist.
-    """
+    """Return the content of a cache entry, and mark it as used now."""
     with (
         _open_folder(place) as within,
         _open(place / name if within is None else name, 0, within) as handle,
@@ -139,7 +133,7 @@ def _read(place: Path, name: str) -> bytes:
 
 @contextlib.contextmanager
 def _open_folder(place: Path) -> Iterator[int | None]:
-    """Yield the handle of the checked folder, so that entries are opened inside it; None on Windows."""
+    """Yield a handle of the checked cache folder, through which its entries are opened; None on Windows."""
     if not hasattr(os, "getuid"):  # Windows: a user's own folders are not writable for others
         yield None
         return
@@ -151,12 +145,6 @@ def _open_folder(place: Path) -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
-    """Yield the handle of a file or folder opened for reading; links are refused.
-
-    Raises:
-        _Untrusted: if another user can have written it.
-        OSError: if it cannot be opened.
-    """
     # O_NONBLOCK: do not wait for the other end of a pipe; Windows has only O_BINARY.
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"):
         flags |= getattr(os, name, 0)
@@ -178,7 +166,6 @@ _UNCHECKED: dict[Path, int] = {}
 
 
 def _bound(place: Path) -> None:
-    """Remove the least recently used entries until the folder is small enough."""
     entries = [(path, path.stat()) for path in place.glob(f"*{SUFFIX}")]
     total = sum(found.st_size for _, found in entries)
     for path, found in sorted(entries, key=lambda entry: entry[1].st_mtime):

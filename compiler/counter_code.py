@@ -22,8 +22,6 @@ class Value:
     """A value in LLVM text, a 64-bit integer (``whole``) or a float64, whose operators write instructions.
 
     Args:
-        text: text to which the operators append.
-        name: name of the value in the text.
         whole: whether it is an integer.
     """
 
@@ -65,12 +63,7 @@ class Value:
 
 
 class _VectorText:
-    """LLVM instructions for a block of lanes, with the operations of :class:`~.counter_numbers.Machine`.
-
-    Args:
-        prefix: prefix of new names.
-        block: block of lanes.
-    """
+    """LLVM instructions for a block of lanes, with the operations of :class:`~.counter_numbers.Machine`."""
 
     def __init__(self, prefix: str, block: LaneBlock) -> None:
         self.lines: list[str] = []
@@ -95,7 +88,6 @@ class _VectorText:
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
 
     def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
-        """Append an instruction and return the name of its result."""
         if whole:
             return self.new(f"{_LLVM[operator]} {self.block.words} {one}, {other}")
         return self.new(f"f{_LLVM.get(operator, 'div')} {self.block.numbers} {one}, {other}")
@@ -132,7 +124,6 @@ Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
-    """Append the code of two random numbers from key, episode, measurement and pair; return their names."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
 
@@ -140,7 +131,6 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Return the LLVM lines of the loop over pairs of random numbers, from the block ``before`` to ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
@@ -173,13 +163,10 @@ def _loop(
 
 @functools.cache
 def llvm_text(block: LaneBlock) -> str:
-    """Return the LLVM text of ``@program(table, first, last)``, which computes the next measurement's random numbers.
+    """Return LLVM text of ``@program(table, first, last)``: the random numbers of the next measurement.
 
     The table contains an unused entry, then address and stride of identities, of measurements and of the rows, then the
     number of normal rows and that of uniform rows.
-
-    Args:
-        block: block of lanes that are computed together.
     """
     entries = (
         *(("identities", "ptr", 1), ("apart", "i64", 2), ("measurements", "ptr", 3)),
@@ -225,11 +212,10 @@ def llvm_text(block: LaneBlock) -> str:
 
 
 def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
-    """Return a compiled call that advances ``t`` by one and writes the random numbers of that measurement.
+    """Return a compiled call that advances ``t`` by one and writes that measurement's random numbers.
 
-    The numbers have the same bits as those of :func:`~.counter_numbers.numbers`. So
-    an episode begins with ``t = -1``: the first run makes the numbers of its start, the next those of its first
-    measurement.
+    The numbers have the same bits as those of :func:`~.counter_numbers.numbers`. An episode begins with ``t =
+    -1``: the first run makes the numbers of its start.
 
     Args:
         identities: identities of the episodes, ``(2, width)`` uint64.

@@ -1,7 +1,6 @@
 """Counter-based random numbers: each is a function of episode, measurement and index, with the same bits everywhere.
 
-**Names.** Episode ``(key, episode)``, two 64-bit integers; measurement ``t``; pair ``p``. No number depends on earlier
-draws, so numbers can be computed in any order, on any machine, and repeatedly.
+**Names.** Episode ``(key, episode)``, two 64-bit integers; measurement ``t``; pair ``p``. Earlier draws have no effect.
 
 **Bits.** Philox4x32-10 makes four words of 32 bits of the counter ``(p, t, episode low, episode high)`` under the key
 ``(key low, key high)``. Ten times, with ``M`` and ``W`` of the paper::
@@ -26,10 +25,10 @@ bits; nothing fused, no function of a library. The functions are written out::
     log m = 2 s + s y P(y),   y = s^2 <= 0.0295
     sin(pi/2 x) = x S(x^2),   cos(pi/2 x) = C(x^2),   x^2 <= 1/4
 
-Each of P, S and C has seven coefficients. It interpolates its function in the seven Chebyshev nodes of its interval,
-where the error is within a small factor of the least possible one, and the coefficients are rounded to float64. The
-remaining error is below the rounding of the operations: 2^-51.5 of P, of which 0.015 at most counts in the logarithm;
-2^-53.9 of S; 2^-53.1 of C. A test derives the coefficients again.
+Each of P, S and C has seven coefficients. It interpolates its function in the seven Chebyshev nodes of its
+interval, and the coefficients are rounded to float64. The remaining error is below the rounding of the
+operations: 2^-51.5 of P, of which 0.015 at most counts in the logarithm; 2^-53.9 of S; 2^-53.1 of C. A test
+derives the coefficients again.
 
 The algorithm is written once, for operands with ``+ - * / & | ^ << >>``: arrays of NumPy here, text of LLVM in
 :mod:`.counter_code`.
@@ -106,13 +105,13 @@ C = tuple(
 
 
 class Machine(Protocol):
-    """Protocol of the operations on numbers and bits that are no Python operators."""
+    """Protocol of the operations on numbers and bits that have no Python operator."""
 
     def bits(self, number: Any) -> Any:
         """Return the bits of a float64 as a 64-bit integer."""
 
     def number(self, bits: Any) -> Any:
-        """Return the float64 with these bits."""
+        """Return the float64 with the bits of a 64-bit integer."""
 
     def sqrt(self, number: Any) -> Any:
         """Return the square root of a float64."""
@@ -122,7 +121,7 @@ class Machine(Protocol):
 
 
 def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Return the four words of Philox4x32-10; words are 64-bit integers below 2^32."""
+    """Return the four 32-bit words that Philox4x32-10 makes of a counter under a key, in 64-bit integers."""
     (c0, c1, c2, c3), (k0, k1) = counter, key
     for number in range(ROUNDS):
         if number > 0:
@@ -133,7 +132,7 @@ def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[An
 
 
 def pair_of_bits(key: Any, episode: Any, t: Any, pair: Any) -> tuple[Any, Any]:
-    """Return the two 64-bit random integers of an episode, a measurement and a pair."""
+    """Return two 64-bit random integers, a function of episode key and number, measurement and pair index."""
     c0, c1, c2, c3 = philox((pair, t, episode & LOW, episode >> 32), (key & LOW, key >> 32))
     return (c0 << 32) | c1, (c2 << 32) | c3
 
@@ -178,8 +177,6 @@ def uniform_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
 
 
 class _Arrays:
-    """Operations on NumPy arrays of uint64 and float64."""
-
     def bits(self, number: numpy.ndarray) -> numpy.ndarray:
         return number.view(numpy.uint64)
 
@@ -197,16 +194,10 @@ ARRAYS = _Arrays()
 
 
 def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms: int) -> numpy.ndarray:
-    """Return the random numbers of N episodes at measurements, ``(..., normals + uniforms, N)``.
+    """Return the random numbers of N episodes at given measurements, ``(..., normals + uniforms, N)``.
 
-    ``normals`` standard normal numbers come first, then ``uniforms`` uniform ones.
-
-    Args:
-        identities: identities of the episodes, ``(2, N)`` uint64.
-        t: measurements, ``(..., N)`` integers from 0 to 2^32 - 1.
-        normals: number of normal numbers.
-        uniforms: number of uniform numbers.
-
+    Standard normal numbers come first, then uniform ones. Identities are ``(2, N)`` uint64, ``t`` ``(..., N)``
+    integers from 0 to 2^32 - 1.
     """
     key, episode = identities
     t = numpy.asarray(t).astype(numpy.uint64)[..., None, :]

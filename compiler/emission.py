@@ -24,8 +24,6 @@ LONG = 5000
 
 
 class _Places(NamedTuple):
-    """Indices in the scratch array."""
-
     slots: dict[int, int]
     """Index for each step that crosses a cut."""
     products: dict[int, int]
@@ -45,7 +43,7 @@ class _Part(Instructions):
         self.known: set[int] = set()
 
     def value(self, step: int) -> str:
-        """Return the name of a step's value; inputs, constants and scratch values are loaded at first use."""
+        """Return the LLVM name of a step's value; inputs, constants and scratch values are loaded at first use."""
         operation, arguments, logical = self.steps[step]
         name = f"%v{step}"
         if step not in self.known:
@@ -81,7 +79,6 @@ class _Part(Instructions):
         self.operate(step.operation, values, step.logical, known, f"%v{index}")
 
     def _product(self, index: int) -> None:
-        """Append code that stores the vector in the scratch array and calls the loop of the product."""
         table, rows, *vector = self.steps[index].arguments
         for place, step in enumerate(vector):
             value = self.value(step)
@@ -115,18 +112,10 @@ def emit(
     part: int,
     loops: bool = False,
 ) -> str:
-    """Return the LLVM text of a program.
+    """Return LLVM text that computes a program for a range of lanes.
 
-    Args:
-        program: the program.
-        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        library: library of the functions; no function takes more lanes than the block has.
-        block: block of lanes that are computed together.
-        part: number of statements of a part: computed steps and stored results.
-        loops: whether a long program is computed in loops where they are shorter.
-
-    Raises:
-        KeyError: for a function that is not in the library.
+    A part of the text has ``part`` statements: computed steps and stored results. An argument that is ``lane_first``
+    has layout ``(N, rows)``, else ``(rows, N)``. No function of the library takes more lanes than the block has.
     """
     text = [*_declarations(program, library, block)]
     rolled = roll_where_shorter(program) if loops and len(program.steps) >= LONG else None
@@ -146,7 +135,6 @@ def emit(
 def _parts(
     program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
-    """Return the LLVM functions of a straight line, and the length of their scratch array."""
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
@@ -185,7 +173,7 @@ def _entry(block: LaneBlock, parts: int, slots: int) -> Iterator[str]:
 
 
 def product_symbol(block: LaneBlock) -> str:
-    """Return the name of the function that multiplies a constant matrix with a vector."""
+    """Return the name of the LLVM function that multiplies a constant matrix with a vector."""
     return f"filtergym_product_{block.lanes}"
 
 
@@ -193,11 +181,8 @@ def product_symbol(block: LaneBlock) -> str:
 def product_text(block: LaneBlock) -> str:
     """Return the LLVM text of ``@program(matrix, vector, result, columns, bands)``, a matrix-vector product.
 
-    The matrix contains constants, the vector lane values. The rows of a band are computed in parallel; each row's terms
-    are added in order. The code is separate and always optimised, as programs spend most of their time in it.
-
-    Args:
-        block: block of lanes of the vector.
+    The rows of a band are computed in parallel; each row's terms are added in order. The code is separate and
+    always optimised, as programs spend most of their time in it.
     """
     return "\n".join(_product_lines(block))
 
@@ -245,7 +230,6 @@ def _product_lines(block: LaneBlock) -> Iterator[str]:
 
 
 def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
-    """Yield LLVM declarations of intrinsics, and functions of a block that call those of the library."""
     used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
@@ -261,7 +245,6 @@ def _declarations(program: StraightLineProgram, library: Library, block: LaneBlo
 
 
 def _block_function(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
-    """Yield the LLVM lines of a function of a block that calls a library function of ``lanes`` lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"
     operands = ("%a", "%b") if name in BINARY else ("%a",)

@@ -24,7 +24,7 @@ FEWEST = 512
 
 
 class Leaf(NamedTuple):
-    """Shape and type of one array in a nested structure."""
+    """Shape and type of one array in nested tuples."""
 
     shape: tuple[int, ...]
     """Shape without the last axis, that of the lanes."""
@@ -33,12 +33,12 @@ class Leaf(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """Number of entries of the array for one lane."""
+        """Number of entries of the array in each lane (parallel episode)."""
         return math.prod(self.shape)
 
 
 def leaves(part: Any) -> list[Any]:
-    """Return a list of the arrays in nested tuples and dictionaries, in order; None contains no array."""
+    """Return the arrays in nested tuples and dictionaries as a flat list; None contains no array."""
     if part is None:
         return []
     if isinstance(part, dict):
@@ -49,7 +49,7 @@ def leaves(part: Any) -> list[Any]:
 
 
 def map_arrays(function: Callable[[Any], Any], part: Any) -> Any:
-    """Return nested tuples and dictionaries with a function applied to every array; None stays None."""
+    """Apply a function to every array in nested tuples and dictionaries, and return the results so nested."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -68,19 +68,15 @@ def _leaf(array: Any) -> Leaf:
 
 
 class Specialised:
-    """A function traced for arguments of one structure, and its program.
+    """A function traced for arguments of one structure, with its compiled program.
 
     Args:
         function: function of nested tuples of arrays.
-        graph: graph of the constants that the function refers to.
-        parts: arguments, or others of the same structure.
         turned: whether the last array of the result has layout ``(N, rows)``, lane by lane.
-        given_turned: whether the first argument has layout ``(N, rows)``, lane by lane.
         unchanged: outputs that may be replaced by an unchanged input: all of them (None), or those with a number below
             this one, by the input of the same number.
 
     Attributes:
-        inputs: arrays of the arguments.
         outputs: arrays of the result.
         same: for each output the number of the input that replaces it, or None.
         template: nested tuples of the result, with the numbers of ``outputs`` in place of arrays.
@@ -132,13 +128,13 @@ class Specialised:
         self.code: Code | None = None
 
     def compile(self, library: Library | None = None) -> Code:
-        """Return the machine code of the program, compiled at the first call."""
+        """Return the machine code of the traced function, compiled at the first call."""
         if self.code is None:
             self.code = native(self.program, self.lane_first, library)
         return self.code
 
     def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
-        """Return a call of the function on fixed input and output arrays, ``(rows, N)`` or ``(..., N)``."""
+        """Return a call of the compiled function that is bound to these input and output arrays."""
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
@@ -146,7 +142,7 @@ class Specialised:
         return Call(self.compile(), numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
-        """Run the function on input arrays of one width; return new output arrays, None where an input replaces one."""
+        """Run the function on input arrays of ``width`` lanes; return its outputs, None for unchanged inputs."""
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -172,7 +168,7 @@ class Specialised:
         return outputs
 
     def example(self) -> Any:
-        """Return a result with arrays of zeros, as an example of its structure for tracing."""
+        """Return zeros in the structure of the function's result, to trace another function with."""
         return map_arrays(
             lambda place: numpy.zeros(
                 (*self.outputs[place].shape, LANES), dtype=DTYPES[self.outputs[place].kind]
@@ -182,12 +178,10 @@ class Specialised:
 
 
 class Call:
-    """Machine code bound to fixed arrays.
+    """Native call of compiled code on fixed arrays, for any range of lanes.
 
     Args:
-        code: code of the function.
         table: addresses and strides; entry ``1 + 2 i`` is the address of array i.
-        arrays: inputs, then outputs.
         constants: constants whose address is entry 0 of the table.
 
     Attributes:
@@ -205,21 +199,21 @@ class Call:
         self.address: int = address_of(table)
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the machine code for a run over some lanes in all, see :meth:`.native.Code.expect`."""
+        """Return the machine code for a run over this many lanes, see :meth:`.native.Code.expect`."""
         self.native = self._code.expect(lanes, in_sequence)
         return self.native
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
-        """Bind another array of the same shape as argument number ``place``."""
+        """Bind another array of the same shape as array number ``place`` of the call."""
         self.arrays[place] = array
         self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
 
     def copy(self) -> "Call":
-        """Return the same call with its own table."""
+        """Return a copy of the call, on the same arrays, whose arrays can be replaced independently."""
         return Call(self._code, self.table.copy(), list(self.arrays), self._constants)
 
     def __call__(self, first: int, last: int) -> None:
-        """Run the code over the lanes from ``first`` to before ``last``."""
+        """Run the code over the lanes from ``first`` up to, but not including, ``last``."""
         self._uncounted += last - first
         native = self.native
         if native is None or self._uncounted > UNCOUNTED:
@@ -231,16 +225,10 @@ class Call:
 def run_over(
     call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST, grain: int = LANES
 ) -> None:
-    """Call a function of a range of lanes on all lanes, divided between some threads.
+    """Call a function of a range of lanes on all lanes, divided between threads.
 
-    The results do not depend on the number of threads.
-
-    Args:
-        call: function of the first lane and the end of the lanes.
-        width: number of lanes.
-        threads: number of threads, including this one.
-        fewest: minimal number of lanes of a thread.
-        grain: number of adjacent lanes that are not divided between threads.
+    ``call`` is a function of the first lane and the end of a range. A thread, of which this is one, has ``fewest``
+    lanes at least; ``grain`` adjacent lanes are not divided. The results do not depend on the number of threads.
     """
     threads = min(threads, width // fewest)
     if threads <= 1:
@@ -256,12 +244,11 @@ def run_over(
 
 @functools.cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Return the pool of threads of a process; a forked process has its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
 def round_up_lanes(count: int) -> int:
-    """Return the number of lanes rounded up to a multiple of ``LANES``."""
+    """Return a number of lanes rounded up to a multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
 
@@ -275,12 +262,12 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
 
 
 def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
-    """Return a list of uninitialised arrays for a program's inputs or outputs."""
+    """Return uninitialised arrays of ``width`` lanes for the inputs or outputs of a program, as a list."""
     return [empty_lanes(leaf.shape, width) for leaf in arrays]
 
 
 def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
-    """Return copies of arrays in their own types, in the structure of a template of their indices."""
+    """Return the template with each index replaced by a copy of that array, in its own type."""
 
     def copied(i: int) -> numpy.ndarray:
         return memory[i].astype(DTYPES[kinds[i]], order="C")
@@ -298,12 +285,10 @@ def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
 
 
 class CompiledFunction:
-    """A function that is traced and compiled for every structure of its arguments.
+    """A function of arrays, traced and compiled for every structure of its arguments.
 
     Args:
         function: function of nested tuples of arrays ``(..., N)``, which returns such tuples.
-        graph: graph of the constants that the function refers to.
-        turned: whether the last array of the result has layout ``(N, rows)``, lane by lane.
         unchanged: outputs that may be replaced by an unchanged input, see :class:`Specialised`.
 
     Raises:
@@ -320,7 +305,7 @@ class CompiledFunction:
         self._specialised: dict[Any, Specialised] = {}
 
     def specialise(self, *parts: Any) -> Specialised:
-        """Return the function traced for arguments of this structure."""
+        """Return the :class:`Specialised` function for arguments of this structure, from a cache."""
         key = tuple(_structure(part) for part in parts)
         if key not in self._specialised:
             self._specialised[key] = Specialised(
@@ -329,12 +314,7 @@ class CompiledFunction:
         return self._specialised[key]
 
     def __call__(self, *parts: Any, threads: int = 1) -> Any:
-        """Return the function's result for arrays of one width, as new arrays, or inputs where unchanged.
-
-        Args:
-            *parts: nested tuples of arrays ``(..., N)``.
-            threads: number of threads.
-        """
+        """Return the function's result for nested tuples of arrays ``(..., N)``, computed by native code."""
         given = [array for part in parts for array in leaves(part)]
         special = self.specialise(*parts)
         count = max(array.shape[-1] for array in given)
@@ -355,7 +335,7 @@ class CompiledFunction:
 
 
 def _structure(part: Any) -> Any:
-    """Return the structure of an argument, as a key; arguments with equal keys share one program."""
+    """Return a hashable key of an argument's structure; arguments with equal keys share one program."""
     if isinstance(part, tuple):
         return type(part), *(_structure(item) for item in part)
     if isinstance(part, dict):
@@ -364,7 +344,7 @@ def _structure(part: Any) -> Any:
 
 
 def _ready(array: Any, width: int) -> numpy.ndarray:
-    """Return an array in the layout of the code: float64, contiguous rows, a multiple of eight lanes."""
+    """Return an array as the code needs it: float64, contiguous rows, a multiple of eight lanes."""
     if array.__class__ is not numpy.ndarray or array.dtype != numpy.float64:
         array = numpy.asarray(array, dtype=numpy.float64)
     if array.shape[-1] != width:
@@ -385,12 +365,10 @@ def address_of(array: numpy.ndarray) -> int:
 
 
 def _stride(array: numpy.ndarray) -> int:
-    """Return the distance from one row to the next, as a number of entries."""
     # An axis of one row may have any stride.
     apart = [stride for length, stride in zip(array.shape[:-1], array.strides, strict=False) if length > 1]
     return apart[-1] // array.itemsize if apart else 0
 
 
 def _lane_stride(array: numpy.ndarray) -> int:
-    """Return the distance from one lane to the next for layout lane by lane, as a number of entries."""
     return array.strides[0] // array.itemsize

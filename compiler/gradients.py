@@ -76,18 +76,15 @@ gradient.
 def pullback(
     graph: Graph, outputs: Sequence[Traced], adjoints: Sequence[Traced], inputs: Sequence[Traced]
 ) -> list[Traced]:
-    """Return the gradients of ``sum(adjoint * output)`` with respect to some arrays, by reverse mode.
+    """Return the gradient of ``sum(adjoint * output)`` with respect to each of some arrays, by reverse mode.
 
     The graph must be open (:func:`.namespace.tracing`).
 
     Args:
-        graph: graph of the arrays.
+        graph: that of the arrays.
         outputs: arrays that are functions of the inputs.
         adjoints: weights of the outputs, an array of the same shape for each.
         inputs: arrays of any shapes.
-
-    Returns:
-        For each input its gradient, an array of its shape, float64.
     """
     flowing: dict[int, Any] = {}
     roots: list[int] = []

@@ -14,15 +14,12 @@ HEADER = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
 
 
 class Instructions:
-    """Writer of LLVM instructions of one part.
+    """Writer of the LLVM instructions of one function.
 
     Args:
         lane_first: for every argument whether its layout is lane by lane.
         block: block of lanes that are computed together.
         head: list to which loads of arguments' addresses are appended; default: ``lines``.
-
-    Attributes:
-        lines: lines of the text.
     """
 
     def __init__(self, lane_first: Sequence[bool], block: LaneBlock, head: list[str] | None = None) -> None:
@@ -38,7 +35,7 @@ class Instructions:
         self.constants: str = self._entry("ptr", 0)
 
     def new(self, expression: str, name: str | None = None, lines: list[str] | None = None) -> str:
-        """Append an instruction and return the name of its value."""
+        """Append an instruction; return the name of its value."""
         if name is None:
             self._names += 1
             name = f"%t{self._names}"
@@ -48,7 +45,7 @@ class Instructions:
     # --- arguments
 
     def argument(self, argument: int) -> tuple[str, str]:
-        """Return the names of an argument's address and stride, loaded at first use."""
+        """Return the LLVM names of an argument's address and stride, loaded at first use."""
         if argument not in self._arguments:
             self._arguments[argument] = (
                 self._entry("ptr", 1 + 2 * argument),
@@ -61,7 +58,7 @@ class Instructions:
         return self.new(f"load {kind}, ptr {address}, !invariant.load !0", lines=self.head)
 
     def place(self, argument: int, row: int | str) -> str:
-        """Return the name of the address of the block's numbers in a row of an argument."""
+        """Return the LLVM name of the address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
         if argument not in self._first_rows:
             self._first_rows[argument] = self.new(
@@ -71,7 +68,7 @@ class Instructions:
         return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def read(self, argument: int, row: int | str, name: str | None = None) -> str:
-        """Append the load of a row of an argument; return the name of the value."""
+        """Append the load of a row of an argument, for the block's lanes; return the name of the value."""
         if not self.lane_first[argument]:
             return self.new(f"load {self.numbers}, ptr {self.place(argument, row)}, align 8", name)
         value = "poison"
@@ -91,7 +88,6 @@ class Instructions:
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _lane_places(self, argument: int, row: int | str) -> Iterator[str]:
-        """Yield the names of the addresses of the block's numbers in an argument with layout lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
@@ -101,7 +97,7 @@ class Instructions:
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def constant(self, address: str, name: str | None = None) -> str:
-        """Append the load of a constant into every lane; return the name of the value."""
+        """Append the load of one constant into every lane; return the name of the value."""
         value = self.new(f"load double, ptr {address}, !invariant.load !0")
         one = self.new(f"insertelement {self.numbers} poison, double {value}, i32 0")
         return self.new(self.block.repeat(one, self.numbers), name)
@@ -128,21 +124,16 @@ class Instructions:
         return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
 
     def call(self, function: str, *values: str, name: str | None = None) -> str:
-        """Append a call of a function of numbers; return the name of the value."""
+        """Append a call of a function, such as exp, in each lane; return the name of the value."""
         listed = ", ".join(f"{self.numbers} {value}" for value in values)
         return self.new(f"call {self.numbers} {function}({listed})", name)
 
     def operate(
         self, operation: str, values: Sequence[str], logical: bool, known: Sequence[bool], name: str
     ) -> None:
-        """Append the instructions of an operation.
+        """Append the instructions of an arithmetic operation.
 
-        Args:
-            operation: operation of a step, except ``take`` and ``product``.
-            values: names of its arguments.
-            logical: whether its result is a boolean.
-            known: whether each argument is a constant.
-            name: name of the result.
+        It is none of ``take`` and ``product``; ``known`` states whether each argument is a constant.
         """
         a, *rest = values
         if operation in _INFIX:
@@ -177,7 +168,7 @@ class Instructions:
             self.call(callee, a, *rest, name=name)
 
     def _remainder(self, a: str, b: str, name: str) -> None:
-        """Append the remainder with the sign of the divisor, rounded once if the quotient is below ``2^53``."""
+        """Append the remainder with the divisor's sign, rounded once for a quotient below ``2^53``."""
         quotient = self.new(f"fdiv {self.numbers} {a}, {b}")
         whole = self.call(self.block.intrinsic("floor"), quotient)
         minus = self.new(f"fneg {self.numbers} {whole}")
@@ -188,7 +179,7 @@ class Instructions:
         self.choice(opposite, above, rest, name=name)
 
     def take(self, start: int, length: int, place: str, name: str) -> None:
-        """Append the lookup in a table of constants that begins at the index ``start``."""
+        """Append the lookup in the ``length`` constants from ``start`` on, at an index in each lane."""
         size, last = self.block.constant(f"{length}.0"), self.block.constant(f"{length - 1}.0")
         from_end = self.new(f"fadd {self.numbers} {place}, {size}")
         place = self.choice(self.compare("olt", place, self.block.zero), from_end, place)

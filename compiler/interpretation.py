@@ -13,7 +13,7 @@ _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": n
 
 
 def first_steps(program: StraightLineProgram, results: int) -> int:
-    """Return the number of steps after which a program's first results are computed."""
+    """Return the number of steps after which a program's first ``results`` results are computed."""
     return 1 + max((result.node for result in program.results[:results]), default=-1)
 
 
@@ -24,13 +24,13 @@ def interpret(
     between: Callable[[Sequence[numpy.ndarray]], None] | None = None,
     results: int = 0,
 ) -> list[numpy.ndarray]:
-    """Return the results of a program for N lanes, computed with NumPy.
+    """Return the results of a program for N lanes, computed with NumPy in any precision.
 
     Args:
         program: the program.
         read: function from argument and row to an input, ``(N,)`` or a number; called at first use.
         dtype: type of all numbers; a constant beyond its range becomes the nearest normal number.
-        between: called with the first results as soon as they are known, before any other input is read.
+        between: called with the first results, before any other input is read.
         results: number of these results.
     """
     constants = in_range(program.constants, dtype)
@@ -66,7 +66,7 @@ def interpret(
 
 
 def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
-    """Return the constants in a precision; those beyond its range become the nearest normal numbers."""
+    """Return constants in a floating-point type; those beyond its range become its nearest normal numbers."""
     limits = numpy.finfo(dtype)
     size = numpy.clip(numpy.abs(constants), float(limits.tiny), float(limits.max))
     changed = numpy.isfinite(constants) & (constants != 0.0) & (limits.dtype != numpy.float64)

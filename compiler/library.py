@@ -20,7 +20,7 @@ ROUNDING = ("floor", "ceil", "trunc", "rint", "fma")
 
 
 class LibraryFunction(NamedTuple):
-    """Symbol, number of lanes and address of a library function."""
+    """Symbol, address and number of lanes of a function such as exp."""
 
     symbol: str
     lanes: int
@@ -29,7 +29,7 @@ class LibraryFunction(NamedTuple):
 
 
 class Library(NamedTuple):
-    """Name and functions of a library."""
+    """Name and functions of a library of elementary functions."""
 
     name: str
     functions: dict[str, LibraryFunction]
@@ -53,7 +53,7 @@ def _open(*names: str | None) -> ctypes.CDLL | None:
 
 @functools.cache
 def portable_library() -> Library:
-    """Return the scalar functions of the C library."""
+    """Return the scalar elementary functions of the C library, one lane per call."""
     library = _open("ucrtbase") if sys.platform == "win32" else _open("libm.so.6", None)
     functions = {}
     for name in (*FUNCTIONS, *ROUNDING):
@@ -65,11 +65,7 @@ def portable_library() -> Library:
 
 @functools.cache
 def fastest_library(features: str) -> Library:
-    """Return the fastest functions for a processor: vector functions of glibc if it has them.
-
-    Args:
-        features: features of the processor in LLVM's form, ``+avx2,-avx512f,...``.
-    """
+    """Return the elementary functions for a processor's LLVM features: glibc's vector ones if it has them."""
     there = features.split(",")
     vectors = _open("libmvec.so.1")
     if platform.machine() == "aarch64":

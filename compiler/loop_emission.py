@@ -12,13 +12,13 @@ from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, common_
 
 
 class DistanceTables:
-    """LLVM constants with the irregular distances between members."""
+    """LLVM constant tables with the irregular distances between elements that loops access."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[int, ...], int] = {}
 
     def find(self, distances: tuple[int, ...]) -> tuple[str, str]:
-        """Return the name of the table with these distances, and the LLVM type of its entries."""
+        """Return the name of the table with these distances, made if new, and the LLVM type of its entries."""
         number = self._found.setdefault(distances, len(self._found))
         return f"@places{number}", _kind(distances)
 
@@ -41,9 +41,7 @@ class LoopText(Instructions):
     """Writer of the LLVM text of one loop.
 
     Args:
-        loop: the loop.
         lane_first: for every argument whether its layout is lane by lane.
-        block: block of lanes that are computed together.
         tables: tables of all loops.
     """
 
@@ -60,7 +58,7 @@ class LoopText(Instructions):
             self._compute(statement)
 
     def text(self, number: int) -> list[str]:
-        """Return the LLVM lines of the loop as a function ``@partN``."""
+        """Return the LLVM lines of the loop as the function ``@partN`` of this number."""
         lines = [f"define internal void @part{number}({HEADER}) {{", "entry:", *self.head]
         if self.loop.turns == 1:
             return [*lines, *self.lines, "ret void", "}"]
@@ -127,7 +125,7 @@ class LoopText(Instructions):
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """Return a base location, and the name of the LLVM value of a turn's distance from it; None: zero."""
+        """Return an offset, and the LLVM name of a turn's distance from it; None: always zero."""
         step = common_difference(places)
         if step == 0:
             return places[0], None

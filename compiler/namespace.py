@@ -26,15 +26,14 @@ _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
 class NotTraceable(TypeError):  # noqa: N818  (not an error in the function)
-    """Error for a function that cannot be expressed as a straight line of arithmetic."""
+    """Error for a function that cannot be traced as a straight line of arithmetic."""
 
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Open a graph inside the context: arithmetic on traced arrays adds expressions to it; other threads wait.
+    """Context manager: arithmetic on traced arrays adds its expressions to this graph; other threads wait.
 
-    Raises:
-        NotTraceable: in place of any exception inside, as functions may fail on symbols in any way.
+    Any exception inside becomes :class:`NotTraceable`, as functions may fail on symbols in any way.
     """
     with without_collection():
         token = _OPEN.set(graph)
@@ -51,7 +50,7 @@ def tracing(graph: Graph) -> Iterator[Graph]:
 
 
 def _plain_value(array: Any, use: str) -> Any:
-    """Return the number that the open graph has for an expression, see :meth:`.Graph.settle`; None: it has none."""
+    """Return the plain number of an expression (:meth:`.Graph.settle`); None: it has none."""
     graph = _OPEN.get(None)
     return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
 
@@ -94,7 +93,7 @@ def _refuse_entry(self: Any, *_: Any) -> Any:
 
 
 class Traced:
-    """Array of expressions of a graph.
+    """Array of symbolic expressions, which records the arithmetic on it.
 
     Attributes:
         nodes: indices of the expressions in the open graph.
@@ -117,7 +116,6 @@ class Traced:
         self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
-        """Return a NumPy array of objects, for which NumPy's own arithmetic creates expressions."""
         from . import numpy_functions  # noqa: F401  (adds the methods that NumPy calls)
 
         objects = numpy.empty(self.shape, dtype=object)
@@ -217,7 +215,7 @@ class Traced:
         return mean(self, axis)
 
     def item(self) -> "Traced":
-        """Return the only entry, as an array without axes."""
+        """Return the only entry, as a traced array without axes."""
         return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
@@ -246,7 +244,7 @@ class Traced:
 
 
 def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
-    """Return values as a traced array of ``dtype``: a traced array itself, numbers and arrays as constants."""
+    """Return values as a traced array: a traced one itself, numbers and NumPy arrays as constants."""
     if isinstance(values, Traced):
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
@@ -284,7 +282,7 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Return arrays as traced arrays of one kind, numbers or booleans, and NumPy's common type."""
+    """Return arrays as traced arrays, all of numbers or all of booleans, and their common NumPy type."""
     if builtins.all(isinstance(array, Traced) and array.dtype == float64 for array in arrays):
         return list(arrays), float64
     found = [asarray(array) for array in arrays]
@@ -407,8 +405,6 @@ def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
 
 
 def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return the traced form of a NumPy function that rearranges the entries of one array."""
-
     @functools.wraps(move)
     def function(x: Any, *arguments: Any, **keywords: Any) -> Traced:
         x = asarray(x)
@@ -418,8 +414,6 @@ def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
 
 
 def _gatherer(gather: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return the traced form of a NumPy function that joins several arrays."""
-
     @functools.wraps(gather)
     def function(arrays: Any, *, axis: int | None = 0) -> Traced:
         found, dtype = _join(list(arrays))
@@ -439,8 +433,6 @@ concat, stack = _gatherer(numpy.concat), _gatherer(numpy.stack)
 
 
 def _maker(make: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return the traced form of a NumPy function that creates an array of constants."""
-
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
         return asarray(make(*arguments, dtype=dtype))
@@ -452,12 +444,12 @@ zeros, ones, eye, arange = (_maker(make) for make in (numpy.zeros, numpy.ones, n
 
 
 def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Return an array filled with one value, which may be traced."""
+    """Return a traced array filled with one value, which may itself be traced."""
     return broadcast_to(asarray(value, dtype), shape)
 
 
 def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Return an array filled with one value, with the shape of another array."""
+    """Return a traced array filled with one value, in the shape of another array."""
     x = asarray(x)
     return full(x.shape, value, dtype=dtype or x.dtype)
 
@@ -478,7 +470,7 @@ def triu(x: Any, /, *, k: int = 0) -> Traced:
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
-    """Return the entries at indices along an axis; indices may be traced.
+    """Return the entries at some indices along an axis; the indices may be traced.
 
     Traced indices read a table of constants, or select among expressions one by one. A large table of constants should
     be a NumPy array, whose numbers do not become expressions.
@@ -504,7 +496,6 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
-    """Return the expressions in each row ``(R, choices)`` at the indices, ``(R, places)``."""
     chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
     open_rows, open_places = [], []
     graph.begin_group()
@@ -572,7 +563,7 @@ def _is_loop(matrix: Any) -> builtins.bool:
 
 
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Return the matrix product, with terms added in order and those with a constant zero left out.
+    """Return the matrix product, its terms added in order, without those of a constant zero.
 
     Where the graph allows loops, the product with a large matrix of constants is a loop.
     """

@@ -47,10 +47,10 @@ see :func:`processor`.
 
 
 def processor() -> tuple[str, str]:
-    """Return name and features of the target processor in LLVM's form.
+    """Return the name and the features of the target processor, as LLVM writes them.
 
-    It is this one, or the value of ``FILTERGYM_COMPILER_PROCESSOR``, such as ``haswell,+avx2`` or ``x86-64``. A name
-    implies its features for LLVM; further features select the vector functions (:func:`~.library.fastest_library`).
+    It is this one, or ``FILTERGYM_COMPILER_PROCESSOR``, such as ``haswell,+avx2`` or ``x86-64``. Features
+    beside a name select the vector functions (:func:`~.library.fastest_library`).
 
     Raises:
         ValueError: for a feature without ``+`` or ``-``.
@@ -67,7 +67,6 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _host() -> tuple[str, str]:
-    """Return name and features of the current processor, cached since LLVM detects them at every call."""
     return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
 
 
@@ -77,7 +76,7 @@ def _target(level: int = 1) -> Any:
 
 
 class Setting(NamedTuple):
-    """Settings of code generation; results have the same bits in every setting."""
+    """Settings of code generation, such as optimisation level; results have the same bits under each."""
 
     lanes: int
     """Number of lanes of a block."""
@@ -90,14 +89,10 @@ class Setting(NamedTuple):
 
 
 def quick_setting(features: str, has_products: bool) -> Setting:
-    """Return the code generation setting with the shortest compilation: no optimisation, loops, small blocks.
+    """Return the settings for the shortest compilation: no optimisation, loops, small blocks.
 
-    With products of matrices the blocks are those of the fastest code, as a product takes twice as long in half of a
-    block.
-
-    Args:
-        features: features of the processor.
-        has_products: whether the program multiplies with matrices.
+    With products of matrices the blocks are those of the fastest code: in half of a block a product takes twice as
+    long.
     """
     return Setting(LANES if has_products else block_for(features).lanes, 150, 0, loops=not has_products)
 
@@ -119,12 +114,9 @@ which on a straight line saves none either, since its code exceeds them.
 
 
 def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
-    """Return the code generation setting with the fastest code; None if that is the quick one.
+    """Return the settings for the fastest code; None if the quick settings already give it.
 
-    Args:
-        quick: the quick setting.
-        steps: number of steps of the program.
-        in_loops: whether the quick code is loops.
+    ``steps`` is the number of steps of the program, ``in_loops`` whether the quick code is loops.
     """
     if steps < LONG:
         return OPTIMISED
@@ -152,7 +144,7 @@ _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=F
 
 @contextmanager
 def optimised_code() -> Iterator[None]:
-    """Optimise programs in a :class:`~.sequence.CallSequence` at once in the context, for reproducible times."""
+    """Context manager: optimise programs in a :class:`~.sequence.CallSequence` at once, not after many lanes."""
     token = _EAGER.set(True)
     try:
         yield
@@ -161,13 +153,11 @@ def optimised_code() -> Iterator[None]:
 
 
 class Code:
-    """Machine code of a program, compiled before its first run and optimised after many lanes.
-
-    A program is first compiled quickly, and optimised once it has run over many lanes, where that saves time.
+    """Machine code of a program: compiled quickly for its first run, optimised after many lanes.
 
     Args:
         make: function that compiles the code quickly.
-        optimise: function that compiles optimised code; None: there is none.
+        optimise: function that compiles optimised code, where that is faster.
         hot: number of lanes after which the code is optimised.
     """
 
@@ -178,7 +168,7 @@ class Code:
         self._run: Native | None = None
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the machine code for a run over some lanes, optimised if that has become worth its time.
+        """Return the machine code for a run over some lanes, optimised if it has run often enough.
 
         Args:
             lanes: number of lanes of the run, summed over its steps.
@@ -194,12 +184,9 @@ class Code:
 
 
 def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Library | None = None) -> Code:
-    """Return the code of a program, shared by all programs that differ only in constants.
+    """Return the machine code of a program, shared by all programs that differ only in constants.
 
-    Args:
-        program: the program.
-        lane_first: for every argument whether its layout is ``(N, rows)``.
-        library: library of the functions; default: the fastest for this processor.
+    An argument that is ``lane_first`` has layout ``(N, rows)``. The default library is the fastest for this processor.
     """
     with LOCK:
         binding, (_, features) = llvm(), processor()
@@ -236,17 +223,10 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
 
 
 def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
-    """Return a native function compiled from an LLVM text without library functions.
+    """Compile an LLVM text without library functions; return it as a native function.
 
-    Its results are the same on every processor.
-
-    Args:
-        text: LLVM text with a function ``@program``.
-        signature: ctypes signature of the function; default: that of :data:`Native`, ``(table, first, last)``.
-        level: LLVM's optimisation level.
-
-    Raises:
-        ImportError: without llvmlite.
+    Its results are the same on every processor. ``signature`` is that of ``@program`` for ctypes, by default of
+    :data:`Native`.
     """
     with LOCK:
         key = _key(text, str(level))
@@ -260,7 +240,7 @@ def _key(*texts: str) -> str:
 
 
 def _text_of(program: StraightLineProgram) -> str:
-    """Return a text that identifies steps and results of a program, independent of constants; faster than emission."""
+    """Return a text that identifies a program up to its constants; faster than its LLVM text."""
     steps, results = program.steps, numpy.array(program.results, dtype=numpy.int64)
     columns = (steps.kinds, steps.begins, steps.arguments, steps.logical, results)
     return " ".join(steps.names) + hashlib.sha256(b"".join(map(numpy.ndarray.tobytes, columns))).hexdigest()
@@ -268,12 +248,11 @@ def _text_of(program: StraightLineProgram) -> str:
 
 @functools.cache
 def _own_text() -> str:
-    """Return the source text of this compiler, on which the machine code depends."""
     return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
 def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) -> Any:
-    """Return the native function for a key, from the cache or compiled from the text that ``write`` returns."""
+    """Return the native function of a cache key; if it is not cached, compile the text that ``write`` returns."""
     binding = llvm()
     code = cache.load(key)
     if code is None:

@@ -16,7 +16,7 @@ from .namespace import NotTraceable, Traced
 
 
 def log_add_exp(one: Any, other: Any) -> Traced:
-    """Return the logarithm of the sum of two exponentials, ``numpy.logaddexp``, without overflow."""
+    """Return ``log(exp(one) + exp(other))`` without overflow, as ``numpy.logaddexp``."""
     larger = namespace.maximum(one, other)
     apart = namespace.abs(namespace.subtract(one, other))
     # The difference of two equal infinities is NaN.
@@ -43,13 +43,13 @@ def mean(x: Any, axis: Any = None) -> Traced:
 
 
 def replace_not_finite(x: Any) -> Traced:
-    """Return the array with NaN replaced by zero and infinities by the largest numbers, ``numpy.nan_to_num``."""
+    """Return NaN replaced by zero and infinities by the largest numbers, as ``numpy.nan_to_num``."""
     largest = float(numpy.finfo(float).max)
     return namespace.clip(namespace.where(namespace.isnan(x), 0.0, x), -largest, largest)
 
 
 def copy_array(x: Any, order: str = "K") -> Traced:
-    """Return the array itself, since it is immutable."""
+    """Return the array itself, since traced arrays are immutable."""
     return namespace.asarray(x)
 
 
@@ -69,14 +69,14 @@ def stack(arrays: Sequence[Any], axis: int = 0) -> Traced:
 
 
 def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
-    """Return a list of the equal parts of an array along an axis."""
+    """Return the equal parts of an array along an axis, as a list."""
     return [Traced(part, x.dtype) for part in numpy.split(x.nodes, sections, axis)]
 
 
 def interpolate(
     x: Any, places: Any, values: Any, left: Any = None, right: Any = None, period: None = None
 ) -> Traced:
-    """Return linear interpolations between increasing points, ``numpy.interp``."""
+    """Return linear interpolations between points with increasing coordinates, ``numpy.interp``."""
     if period is not None:
         raise _refusal(numpy.interp, {"period": period})
     places = numpy.asarray(places, dtype=float)
@@ -254,7 +254,7 @@ for _function, _own in UFUNCS.items():
 
 
 def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:
-    """Return the result of an elementwise NumPy function on traced arrays, or of its reduction along an axis.
+    """Return the result of a NumPy ufunc on traced arrays, elementwise or reduced along an axis.
 
     Raises:
         NotTraceable: for a function that cannot be traced.
@@ -284,8 +284,6 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
 
 
 def _on_objects(function: Any, arguments: Any, keywords: Mapping[str, Any]) -> Any:
-    """Return the result of a NumPy function on arrays of objects, whose arithmetic creates expressions."""
-
     def objects(given: Any) -> Any:
         if isinstance(given, list | tuple):
             return type(given)(map(objects, given))

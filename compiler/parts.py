@@ -14,12 +14,9 @@ Statement = int | ProgramResult
 
 
 def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
-    """Return the statements of each part of a program (at least one part), and the number of parts before a pause.
+    """Cut a program into parts of ``size`` statements; return them, and the number before the pause.
 
-    Args:
-        program: the program.
-        size: number of statements of a part.
-        pause: a step at which a new part begins.
+    There is at least one part. A new one begins at the step ``pause``.
     """
     results: dict[int, list[Statement]] = {}
     for result in program.results:
@@ -35,12 +32,7 @@ def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[
 
 
 def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) -> dict[int, int]:
-    """Return the index in the scratch array of every step that is used in a later part; indices are reused.
-
-    Args:
-        program: the program.
-        parts: parts from :func:`cut_parts`.
-    """
+    """Return the scratch index of every step that is used in a later part; indices are reused."""
     steps = program.steps.all()
     part_of = {step: i for i, part in enumerate(parts) for step in part if isinstance(step, int)}
     last_user: dict[int, int] = {}
@@ -62,12 +54,7 @@ def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) ->
 
 
 def product_places(program: StraightLineProgram, first: int) -> tuple[dict[int, int], int]:
-    """Return the indices of all products' results in the scratch array, and that of a vector after them.
-
-    Args:
-        program: the program.
-        first: first index after the slots.
-    """
+    """Return the scratch index of each product's results, from ``first`` on, and that of a vector after them."""
     places = {}
     for index, (operation, arguments, _) in enumerate(program.steps):
         if operation == "product":

@@ -81,13 +81,13 @@ BEFORE = {"input": 2, "constant": 1, "take": 2, "product": 2, "entry": 1}
 
 
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
-    """Return the matrix ``(rows, columns)`` of a product, from its table in the order of the loop."""
+    """Return the matrix ``(rows, columns)`` of a product from its table, which is in the order of the loop."""
     return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
 
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Disable garbage collection inside the context, and hold the compiler's lock.
+    """Context manager: disable garbage collection and hold the compiler's lock.
 
     None of a hundred thousand new expressions is garbage, and repeated searches would take a third of the time.
     """
@@ -102,7 +102,7 @@ def without_collection() -> Iterator[None]:
 
 
 class Graph:
-    """Expressions of one lane, each stored once.
+    """Graph of the expressions of one lane, each stored once.
 
     ``input`` (argument, row) reads an input of the program; ``constant`` has a value; ``take`` (table, index) reads a
     table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a vector, and ``entry``
@@ -149,30 +149,28 @@ class Graph:
     def settle(self, node: int, use: str) -> Any:
         """Return the plain number of an expression; None, unless a subclass knows one.
 
-        Args:
-            node: the expression.
-            use: ``branch`` for a condition, ``number`` for a conversion to float, ``words`` for formatting.
+        ``use`` is ``branch`` for a condition, ``number`` for a conversion to float, ``words`` for formatting.
         """
         return None
 
     def begin_group(self) -> None:
-        """Begin a new array operation: later expressions belong to it."""
+        """Begin a new array operation: later expressions are its elements."""
         self.group += 1
         if self.callers is not None:
             self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
-        """Return the expression that reads a row of an argument."""
+        """Return the index of the expression that reads a row of an argument."""
         return self._intern(("input", argument, row), "input", (argument, row), None, False)
 
     def constant(self, value: Any) -> int:
-        """Return the expression of a constant number or boolean."""
+        """Return the index of the expression of a constant number or boolean."""
         if isinstance(value, bool | numpy.bool_):
             return self._intern(("constant", bool(value)), "constant", (), bool(value), True)
         return self.constants(numpy.array([value], dtype=numpy.float64))[0]
 
     def constants(self, values: numpy.ndarray) -> list[int]:
-        """Return the expressions of constant numbers, float64 ``(n,)``, as a list."""
+        """Return the indices of the expressions of constant numbers ``(n,)``, as a list."""
         found, made = self._found, []
         # By bits, as -0.0 differs from 0.0, and NaN equals itself.
         for bits, value in zip(values.view(numpy.int64).tolist(), values.tolist(), strict=True):
@@ -183,7 +181,7 @@ class Graph:
         return made
 
     def take(self, table: numpy.ndarray, index: int) -> int:
-        """Return the expression of a table's entry; negative indices count from the end, others are clipped."""
+        """Return the index of the expression of a table's entry; negative indices count from the end."""
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
@@ -193,7 +191,7 @@ class Graph:
         return self._intern(("take", place, index), "take", (place, index), None, False)
 
     def product(self, matrix: numpy.ndarray, vector: Sequence[int]) -> list[int]:
-        """Return the expressions of the entries of a matrix-vector product, summed in the order of columns.
+        """Return the indices of the expressions of a matrix-vector product, summed in the order of columns.
 
         The table contains the matrix in the order of the loop: bands of ``BAND`` rows, the last one padded with zeros,
         and in each band the columns one after the other.
@@ -224,7 +222,7 @@ class Graph:
         return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
-        """Return the expression of an operation on other expressions, simplified if possible."""
+        """Return the index of the expression of an operation on others, simplified if possible."""
         known = self.values
         values = [known[argument] for argument in arguments]
         if None not in values:
@@ -239,12 +237,9 @@ class Graph:
         return self._intern(key, name, arguments, None, logical)
 
     def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Return the expressions of an array operation, ``(n,)``, as :meth:`node` does, but faster.
+        """Return the indices of an array operation's expressions, ``(n,)``: :meth:`node` for many at once.
 
-        Args:
-            name: name of the operation.
-            columns: for each argument the expressions of all members, ``(n,)``.
-
+        ``columns`` are the expressions of each argument, ``(n,)``.
         """
         if len(columns[0]) < FEW:
             rows = zip(*(column.tolist() for column in columns), strict=True)
@@ -278,7 +273,7 @@ class Graph:
         known: Sequence[numpy.ndarray],
         numbers: Sequence[Any],
     ) -> Any:
-        """Return a mask of the array elements that :meth:`_simpler` may simplify beyond the rules in :meth:`nodes`."""
+        """Return a mask of the elements that :meth:`_simpler` may simplify beyond :meth:`nodes`."""
         if name in ("maximum", "minimum"):
             return numpy.logical_or.reduce(
                 [there & (number != number) for there, number in zip(known, numbers, strict=True)]
@@ -293,7 +288,6 @@ class Graph:
         return name in ("negative", "logical_and", "logical_or")
 
     def _count(self) -> None:
-        """Copy the constant values of new expressions into arrays."""
         first, count = self._counted, len(self.values)
         if count > len(self._numbers):
             for each in ("_numbers", "_known"):
@@ -306,7 +300,6 @@ class Graph:
         self._counted = count
 
     def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Return the expressions of array elements that have no simpler form; add the new ones."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
         keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
@@ -330,7 +323,7 @@ class Graph:
         return made
 
     def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
-        """Return a simpler expression that is equal for finite numbers; None if there is none."""
+        """Return an expression that is equal for finite numbers and simpler; None if there is none."""
         if name in ("logical_and", "logical_or"):
             for known, other in ((0, 1), (1, 0)):
                 if values[known] is not None:
@@ -367,7 +360,7 @@ class Graph:
         return a if y == 1.0 else None
 
     def live(self, wanted: Iterable[int]) -> list[int]:
-        """Return the expressions needed to compute the wanted ones, in topological order, each as late as possible."""
+        """Return the expressions that the wanted ones need, in topological order, each as late as possible."""
         seen = bytearray(len(self.operations))
         order: list[int] = []
         operations, arguments, finish = self.operations, self.arguments, order.append
@@ -389,13 +382,12 @@ class Graph:
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
-        """Return the expressions on which an expression directly depends."""
+        """Return the expressions that are direct arguments of an expression."""
         name = self.operations[node]
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
 
 def _callers() -> str:
-    """Return the names of the nearest functions on the stack outside this package, in two different files, as text."""
     found: dict[str, str] = {}
     frame: types.FrameType | None = sys._getframe(2)
     while frame is not None and len(found) < 2:
@@ -408,7 +400,6 @@ def _callers() -> str:
 
 @functools.cache
 def _stem_outside(path: str) -> str | None:
-    """Return the name of a source file without its ending; None for a file of this package."""
     return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
@@ -432,7 +423,7 @@ class ProgramStep(NamedTuple):
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """Indices of the steps on which it directly depends."""
+        """Indices of the steps that are its arguments."""
         return self.arguments[BEFORE.get(self.operation, 0) :]
 
     logical: bool
@@ -442,7 +433,6 @@ class ProgramSteps(Sequence[ProgramStep]):
     """Steps of a program as arrays; a :class:`ProgramStep` is made on access.
 
     Args:
-        names: names of the operations.
         kinds: index in ``names`` of each step's operation, ``(n,)``.
         begins: offset of each step's arguments in ``arguments``, ``(n + 1,)``.
         arguments: arguments of all :class:`ProgramStep`, one after the other.
@@ -470,7 +460,7 @@ class ProgramSteps(Sequence[ProgramStep]):
         return frozenset([self.names[int(kind)] for kind in numpy.unique(self.kinds)])
 
     def which(self, *operations: str) -> numpy.ndarray:
-        """Return a boolean mask ``(n,)`` of the steps with one of the operations."""
+        """Return a mask ``(n,)`` of the steps with one of these operations."""
         return numpy.isin(self.kinds, [kind for kind, name in enumerate(self.names) if name in operations])
 
     def named(self, operation: str) -> list[ProgramStep]:
@@ -533,7 +523,7 @@ class StraightLineProgram(NamedTuple):
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgram:
-    """Return the straight-line program that computes some expressions of a graph."""
+    """Return the straight-line program that computes some expressions of a graph and stores the results."""
     order = graph.live(result.node for result in wanted)
     operations = list(map(graph.operations.__getitem__, order))
     given = list(map(graph.arguments.__getitem__, order))

@@ -2,9 +2,8 @@
 
 A trace consists of scalars, each with the number of the array operation that made it
 (:attr:`.StraightLineProgram.origins`). Members of one operation are independent: they become one :class:`Statement`.
-Statements with equal numbers of members share a loop, where a member may use results of the same turn; all other values
-pass from loop to loop through a scratch array. Operations, operands and their order are those of the straight line, so
-that the results have the same bits.
+Statements with equal numbers of members share a loop, where a member may use results of the same turn; all other
+values pass through a scratch array. Results have the same bits as those of the straight line.
 """
 
 import heapq
@@ -31,7 +30,7 @@ turn of the same loop, and any computed value.
 
 
 class Operand(NamedTuple):
-    """Locations that the members of a statement read or write."""
+    """Array elements that the members of a statement read or write, one for each turn of the loop."""
 
     array: int
     """Number of an argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
@@ -66,7 +65,7 @@ class Loop(NamedTuple):
 
 
 class Rolled(NamedTuple):
-    """A program as a list of loops."""
+    """A program as loops, with their number before a pause and the length of the scratch array."""
 
     loops: list[Loop]
     before: int
@@ -76,8 +75,6 @@ class Rolled(NamedTuple):
 
 
 class _Read(NamedTuple):
-    """Source of an operand."""
-
     source: int | None
     """Number of the argument, or ``CONSTANTS``; None: the scratch array, or the same turn."""
     turn: int | None
@@ -87,8 +84,6 @@ class _Read(NamedTuple):
 
 
 class _Draft:
-    """A statement before its locations are assigned: members and operands are steps."""
-
     def __init__(
         self,
         operation: str,
@@ -108,8 +103,6 @@ class _Draft:
 
 
 class _Roller:
-    """Algorithm of :func:`roll`, with its data."""
-
     def __init__(self, program: StraightLineProgram, results: int) -> None:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
@@ -136,7 +129,6 @@ class _Roller:
             draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
-        """Copy the arguments of steps into arrays, operation by operation."""
         steps = self.steps
         self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
         for kind, name in enumerate(steps.names):
@@ -161,7 +153,6 @@ class _Roller:
     # --- statements
 
     def _group_steps(self) -> Iterator[numpy.ndarray]:
-        """Yield the steps of each array operation that have one form, in the order of its members."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
@@ -192,7 +183,6 @@ class _Roller:
                 yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
-        """Return the depth of each step in the dependencies among those of its array operation."""
         inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
         inside &= self.source[self.parts] == COMPUTED
         levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
@@ -201,7 +191,6 @@ class _Roller:
         return levels
 
     def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
-        """Add the statements of groups of steps that have one form."""
         heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
         kinds, logical, number = (
             column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
@@ -218,7 +207,6 @@ class _Roller:
             self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
-        """Add the statements that write results: one for the results of a whole statement, one for all others."""
         by_draft: dict[int, list[tuple[int, int]]] = {}
         rest = []
         for row, step in sorted(nodes.items()):
@@ -242,7 +230,6 @@ class _Roller:
         self._add(draft)
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
-        """Return for each operand the argument or constants that contain all of it; None: the scratch array."""
         steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
@@ -253,7 +240,6 @@ class _Roller:
         ]
 
     def _copy_mixed_operands(self) -> None:
-        """Add copies to the scratch array of inputs and constants that share an operand with other values."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
             pairs = zip(columns, self._sources(columns), strict=True)
@@ -269,7 +255,6 @@ class _Roller:
     # --- order
 
     def _find_sources(self) -> Iterator[_Read]:
-        """Yield the sources of all operands of all statements."""
         columns = [column for draft in self.drafts for column in draft.columns]
         counts = numpy.array([draft.count for draft in self.drafts])
         steps, starts, lengths = _join_columns(columns)
@@ -288,7 +273,6 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Return the statements whose members a draft reads, and whether the same turn of a loop suffices for each."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:
@@ -296,7 +280,7 @@ class _Roller:
         return needs
 
     def schedule(self) -> list[list[int]]:
-        """Return the statements of each loop; loops have statements of equal count, as early as operands allow."""
+        """Return the statements of each loop, all with the same number of turns, as early as operands allow."""
         drafts = self.drafts
         waits = [0] * len(drafts)
         users: list[list[tuple[int, bool]]] = [[] for _ in drafts]
@@ -337,7 +321,7 @@ class _Roller:
     # --- places
 
     def finish(self) -> Rolled:
-        """Return the loops, with the locations of all values that pass between them."""
+        """Return the loops, with the array elements of all values that pass between them."""
         loops = self.schedule()
         drafts = self.drafts
         turns: dict[tuple[int, int], int] = {}
@@ -380,9 +364,9 @@ class _Roller:
         return Rolled(made, before, scratch)
 
     def _slots(self, kept: Iterable[int], last: dict[int, int]) -> tuple[dict[int, int], int]:
-        """Return the first index in the scratch array of every stored statement, and the array's length.
+        """Return the first scratch index of every stored statement, and the length of the scratch array.
 
-        Results of one array operation are adjacent, and are stored as long as any of them is needed.
+        Results of one array operation are adjacent, stored as long as any is needed.
         """
         inside: dict[int, int] = {}
         sizes: dict[int, int] = {}
@@ -408,7 +392,6 @@ class _Roller:
 
 
 def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-    """Return the columns as one array, and the start and length of each."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
     return steps, numpy.cumsum(lengths) - lengths, lengths
@@ -416,22 +399,16 @@ def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, nump
 
 @without_collection()
 def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
-    """Return a program as loops over the members of its array operations.
+    """Convert a straight-line program to loops over the elements of its array operations.
 
-    Args:
-        program: program with origins, and without products that are loops.
-        results: number of first results that are written before any other input than theirs is read.
+    The program has origins, and no products that are loops. The first ``results`` results are written before any input
+    is read that they do not need.
     """
     return _Roller(program, results).finish()
 
 
 def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
-    """Return a program as loops if that makes less code; None if a straight line is shorter.
-
-    Args:
-        program: program with origins.
-        results: number of first results, see :func:`roll`.
-    """
+    """Convert a program to loops if that makes less code; return None if a straight line is shorter."""
     if "product" in program.steps.operations:
         return None
     operations = numpy.count_nonzero(~program.steps.which(*FREE))
@@ -441,7 +418,7 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
 
 
 def common_difference(places: Sequence[int]) -> int | None:
-    """Return the difference between successive numbers if it is constant, else None."""
+    """Return the difference between successive integers if it is constant, else None."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0
     regular = range(first, first + step * count, step) if step else (first,) * count

@@ -1,8 +1,7 @@
 """Native calls over many time steps in one call, without a return to Python in between.
 
-A step is a list of calls, each a function and its table of addresses. Two memories alternate between steps: one step
-writes what the next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with
-every step: the address of a row of noise or of a report, or a counter.
+A step is a list of calls, each a function and its table of addresses. Two memories alternate: one step writes what the
+next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with every step.
 
 A tile of lanes passes through all steps before the next tile begins, so that it stays in the processor's cache.
 """
@@ -173,7 +172,7 @@ class Moving(NamedTuple):
 
 
 def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
-    """Return a moving entry with which an argument of a call is the next of several arrays at every step.
+    """Return a :class:`Moving` entry that sets an argument of a call to the next of several arrays at each step.
 
     Args:
         call: the call; its argument is set to the first array.
@@ -185,7 +184,7 @@ def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
 
 
 class CallSequence:
-    """Calls over one or many time steps, run as one native call.
+    """Sequence of native calls over one or many time steps, run as one native call.
 
     Args:
         even: calls of an even step, in order.
@@ -241,14 +240,14 @@ class CallSequence:
         )
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
-        """Select the machine code of every call for a run over some lanes, see :meth:`.functions.Call.expect`."""
+        """Select the machine code of every call for a run over this many lanes (:meth:`.functions.Call.expect`)."""
         natives = [call.expect(lanes, in_sequence) for call in self._calls]
         if natives != self._natives:
             self._natives, self._tries, self._seconds = natives, 0, [math.inf, math.inf]
             self._codes[:] = list(map(address_of_code, natives))
 
     def run(self, width: int, threads: int = 1) -> None:
-        """Run all steps over all lanes, with several threads if that was measured to be faster."""
+        """Run all steps over ``width`` lanes, with several threads if that was measured to be faster."""
         count = self._count
         count[0] += width * self._form[1]
         if count[0] > UNCOUNTED:
@@ -293,12 +292,11 @@ class CallSequence:
         self._count = other._count
 
     def run_once(self, width: int, threads: int = 1) -> None:
-        """Run all steps over all lanes once, with optimised code if the number of steps is worth it."""
+        """Run all steps over ``width`` lanes once, with optimised code if the number of steps is worth it."""
         self.expect(self._form[1] * width // 2, in_sequence=True)
         self.run(width, threads)
 
     def _run_share(self, first: int, last: int) -> None:
-        """Run all steps over the lanes from ``first`` to before ``last``, with this thread's own tables and arrays."""
         share = self._shares.get((first, last))
         if share is None:
             share = self._shares[first, last] = self._make_share()
@@ -314,7 +312,6 @@ class CallSequence:
         ends = self._tables + 8 * numpy.array([len(table) for table in tables])
 
         def moved(entries: numpy.ndarray) -> tuple[numpy.ndarray, list[int]]:
-            """Return the addresses of the same entries in these tables, and the numbers of their tables."""
             owners = [int(numpy.flatnonzero((e >= self._tables) & (e < ends))[0]) for e in entries]
             return addresses[owners] + entries - self._tables[owners], owners
 
@@ -331,8 +328,6 @@ class CallSequence:
 
 
 class _Share(NamedTuple):
-    """Tables and arrays of one thread, for its part of the lanes."""
-
     tables: list[numpy.ndarray]
     addresses: numpy.ndarray
     entries: numpy.ndarray

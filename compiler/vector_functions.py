@@ -1,8 +1,8 @@
 """Functions of a vector with exact Jacobians, for arrays of any namespace.
 
 A user's function in NumPy is traced once, on a vector of symbols, and its Jacobian is derived by reverse mode, one row
-for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which can be
-computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
+for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which any array
+namespace can compute.
 """
 
 import functools
@@ -30,7 +30,7 @@ _NAMES = {"absolute": "abs", "rint": "round"}
 
 
 class VectorFunction:
-    """A function of a vector, and its Jacobian by reverse-mode differentiation.
+    """A function of a vector, traced, with its Jacobian by reverse-mode differentiation.
 
     Args:
         function: function from an array ``(n + g,)`` to a sequence or an array of m numbers; or a matrix ``(m, n)``.
@@ -79,7 +79,7 @@ class VectorFunction:
 
     @functools.cached_property
     def linear(self) -> numpy.ndarray:
-        """Mask of the constant entries of the Jacobian, ``(m, n)``, from random states of four magnitudes."""
+        """Mask ``(m, n)`` of the entries of the Jacobian that are constant, judged at random states."""
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
         given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)
@@ -90,7 +90,7 @@ class VectorFunction:
 
     @property
     def reads(self) -> tuple[frozenset[int], ...]:
-        """Indices of the inputs on which each output depends."""
+        """For each output the indices of the inputs on which it depends."""
         found: list[frozenset[int]] = []
         for name, arguments, _ in self._value.steps:
             if name == "input":
@@ -101,23 +101,11 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Return the function's values at N vectors, ``(m, N)``.
-
-        Args:
-            x: vectors, ``(n + g, N)``.
-            xp: array namespace of x.
-
-        """
+        """Return the function's values ``(m, N)`` at vectors ``(n + g, N)``."""
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Return the Jacobians at N vectors with respect to the first n inputs, ``(m, n, N)``.
-
-        Args:
-            x: vectors, ``(n + g, N)``.
-            xp: array namespace of x.
-
-        """
+        """Return the Jacobians ``(m, n, N)`` with respect to the first n inputs at vectors ``(n + g, N)``."""
         entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 
@@ -127,7 +115,7 @@ def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
 
 
 def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
-    """Return the results of a program on an array of lanes ``(n, N)``, as a list of arrays ``(N,)``."""
+    """Return the results of a program on lanes ``(n, N)``, as a list of arrays ``(N,)``."""
     values: list[Any] = []
 
     def array(place: int) -> Any:

@@ -67,13 +67,11 @@ register()
 
 
 def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> None:
-    """Register an environment of your own: it can then be listed, made, evaluated, rendered and trained on as the
-    others.
+    """Register an environment of your own, to be listed, made, evaluated, rendered and trained on as the others.
 
-    Call it where your module or package is imported, not inside a function. Then any process finds the
-    environment by ``module:id``, as in ``gymnasium.make("my_package:mine/Pendulum-v0")`` and on the command
-    line, and a spawned process, such as a worker of an asynchronous vector environment, imports the module
-    by itself.
+    Call it where your module or package is imported, not inside a function. Then any process finds the environment by
+    ``module:id``, as in ``gymnasium.make("my_package:mine/Pendulum-v0")`` and on the command line, and a spawned
+    process imports the module by itself.
 
     Args:
         task: class that fulfils the contract of :class:`filtergym.envs.contract.task.Task`.

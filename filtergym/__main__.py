@@ -85,7 +85,7 @@ def _general(
 
 
 class Program(typer.core.TyperGroup):
-    """Commands in groups, each imported when it is called, so that the help needs no library."""
+    """Click group whose commands are imported when they are called, so that the help needs no library."""
 
     groups: Mapping[str, Commands]
     listing: bool = False
@@ -142,13 +142,13 @@ def _command(name: str, command: Callable[..., None] | str) -> Any:
 
 @functools.cache
 def _docstrings(module: str) -> dict[str, str | None]:
-    """Return the docstring of each function of a module in ``commands``, by its name, without importing the module."""
+    """Return the docstring of each function of a module in ``commands``, by name, without an import of the module."""
     text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
     return {n.name: ast.get_docstring(n) for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)}
 
 
 def _help_command(name: str, command: Callable[..., None] | str, group: str) -> Any:
-    """Return a click command with the help text only, read from the source without importing the module."""
+    """Return a click command that has only a help text, read from the source."""
     if isinstance(command, str):
         module, _, function = command.partition(":")
         words = _docstrings(module)[function]
@@ -172,12 +172,12 @@ def program_of(groups: Mapping[str, Commands]) -> Any:
 
 @functools.cache
 def application() -> Any:
-    """Return the click program ``filtergym``, with all its commands."""
+    """Return the click program ``filtergym`` with all its commands, cached."""
     return program_of(GROUPS)
 
 
 def main(program: Callable[[], Any] = application, name: str = "filtergym") -> None:
-    """Run the command line, or another program with the same handling of errors.
+    """Run the command line, or another program, with errors as one sentence on standard error.
 
     A user's mistake, or a refusal of the operating system, ends in one sentence and exit code 2; an unexpected error in
     one that requests a report, and exit code 1. With ``--debug`` both end in a traceback.

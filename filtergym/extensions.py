@@ -1,7 +1,7 @@
 """Tables of the parts beyond the core, as places ``module:name`` that are imported on first use.
 
-A companion enters its line here; no other file of the core names it. Where its module is missing, the core refuses
-its functions, and everything else works.
+No other file of the core names a companion. Where its module is missing, the core refuses its functions, and
+everything else works.
 """
 
 import importlib
@@ -54,7 +54,7 @@ def load(place: str, package: str | None = PACKAGE) -> Any:
 
 
 def load_present(places: Iterable[str], package: str | None = PACKAGE) -> Iterator[Any]:
-    """Import the objects at several places of a package, except those whose module this installation lacks."""
+    """Yield the imported objects at several places, without those whose module this installation lacks."""
     for place in places:
         module = f"{package}.{place.partition(':')[0]}"
         if module in sys.modules or _is_there(module):

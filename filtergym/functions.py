@@ -110,14 +110,7 @@ def record(
 def requests_of(
     problem: Problem, experiment: Experiment, competitors: Sequence[Competitor], curves: bool = True
 ) -> list[EvaluationRequest]:
-    """Return the :class:`.EvaluationRequest` of each competitor in an experiment.
-
-    Args:
-        problem: problem of the competitors.
-        experiment: experiment from :meth:`.baselines.problem.Problem.experiment`.
-        competitors: competitors that take part.
-        curves: whether figures will be drawn.
-    """
+    """Return the evaluation request of each competitor in an experiment, compared with the paper's algorithm."""
     paper = problem.paper_among({one.name: one.maker for one in competitors})
     experiment = replace(experiment, paper=paper)
     own, horizon = problem.baselines.metrics, experiment.make_task().horizon
@@ -178,11 +171,7 @@ def make_policy(
 def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bool = False) -> SteppingPolicy:
     """Return a policy that acts in the environment of an experiment; its model is that environment's.
 
-    Args:
-        problem: problem of the policy.
-        policy: name, path, object or class; errors as of :func:`make_policy`.
-        experiment: experiment that gives the environment its control, scenario and parameters.
-        trust: whether to load a model's zip, which can execute code.
+    Errors are those of :func:`make_policy`.
     """
     name, maker = _named_policy(problem, policy, trust)
     control = control_of(maker, experiment.control, problem.task, name)
@@ -192,11 +181,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
 
 
 def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
-    """Return the name of a policy for error messages, and its maker.
-
-    Raises:
-        ValueError: for a competitor that does not act.
-    """
+    """Return the name of a policy in errors, and its factory."""
     if isinstance(policy, str | Path):
         name, maker = str(policy), find_competitor(problem, policy, trust).maker
     else:
@@ -219,7 +204,7 @@ def _model_of(env: Any) -> Any:
     """Return the model inside a Gymnasium environment of this package.
 
     Raises:
-        ValueError: if the environment is none of filtergym, or computes in torch.
+        ValueError: if it is none of filtergym, shows the truth, mixes scenarios, or computes in torch.
     """
     inner = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
     if not isinstance(inner, TaskEnv | TaskVectorEnv):

@@ -39,8 +39,8 @@ def online(
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         policy: a name or a path, see :func:`~filtergym.names.competitor`, or an object or a class as in
             :func:`~filtergym.evaluate`. A file of ``filtergym advise`` contains the interval, the noise level and the
-            parameters of the log that it was advised for. Where that log had latitude and longitude, it also contains
-            the origin of x and y, and ``update`` accepts latitude and longitude.
+            parameters of the log that it was advised for; where that log had latitude and longitude, also the origin of
+            x and y, and ``update`` accepts latitude and longitude.
         control: control of the policy; by default its own.
         scenario: scenario that gives the parameters; default: the environment's.
         tracks: number of tracks side by side.

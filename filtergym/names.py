@@ -19,13 +19,13 @@ MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
-    """Return the maker (class or function) of the policy, estimator, reference or bound of a name.
+    """Return the factory (class or function) of the policy, estimator, reference or bound of a name.
 
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's,
-            ``isolated:module:Class`` of an estimator in a process of its own, ``exec:COMMAND`` of any program, or
+            ``isolated:module:Class`` of an estimator in a process of its own, ``exec:COMMAND`` of any program,
             ``gated:NAME`` of a policy: an estimator that returns the estimate of that policy's filter while it is
             trusted, else that of a classical filter, or ``file:PATH`` of another program's estimates. A path always
             means a file or folder, even if something else has its name.
@@ -77,7 +77,7 @@ def _sources() -> Iterator[CompetitorFiles]:
 
 
 def _find_in_files(problem: Problem, name: str, trust: bool) -> Competitor | None:
-    """Return the competitor in a file or folder of that name, or a shipped agent; None if there is none."""
+    """Return the competitor in a file or folder of a name, or the shipped agent of that name; None: neither."""
     found = (source.find(name, problem, trust, partial(_find_shipped, problem)) for source in _sources())
     return next((one for one in found if one is not None), None)
 
@@ -100,7 +100,7 @@ def learned_names(id: str) -> list[str]:
 
 
 def ranked_names(problem: Problem) -> list[str]:
-    """Return the names of all shipped policies and estimators, untuned and tuned, and agents of an environment."""
+    """Return the names of an environment's shipped policies and estimators, tuned ones, and agents."""
     known = problem.baselines
     return [*known.policies, *known.estimators, *problem.tuned_policies, *learned_names(problem.id)]
 

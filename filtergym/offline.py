@@ -1,8 +1,7 @@
 """Minari data sets of episodes of policies, for offline reinforcement learning.
 
 A data set holds the episodes of one policy in one environment: observations, actions and rewards exactly as
-``gymnasium.make`` gives them, and of every episode its seed. ``minari.load_dataset`` reads it, and
-``recover_environment()`` of what it returns makes the environment again.
+``gymnasium.make`` gives them, and of every episode its seed. The environment can be made again from it.
 """
 
 import os
@@ -41,7 +40,7 @@ ENVIRONMENT_KEYWORDS = ("reward", "dtype")
 
 
 class DatasetSummary(NamedTuple):
-    """Summary of a written data set."""
+    """Summary of a written data set: name, policy, environment, size and mean return."""
 
     name: str
     """Name for ``minari.load_dataset``."""
@@ -55,12 +54,7 @@ class DatasetSummary(NamedTuple):
 
 
 def default_policies(problem: Problem, control: str | None = None) -> list[str]:
-    """Return the names of the paper's policy, of the tuned one of least cost, and of random actions.
-
-    Args:
-        problem: problem of the policies.
-        control: control in which the policies must act; None: any.
-    """
+    """Return the names of the paper's policy, the tuned one of least cost, and random actions."""
     paper = problem.baselines.score_paper
     names = [paper, problem.tuned_values.best_policy(control), RANDOM]
     own = getattr(problem.competitor(paper), "control", None) if paper else None
@@ -106,9 +100,6 @@ def write_datasets(
         trust: whether to load a model's zip, which can execute code.
         **keywords: parameters of the task; also ``reward`` and ``dtype`` of ``gymnasium.make``.
 
-    Returns:
-        Summaries of the data sets, in the order of the policies.
-
     Raises:
         ValueError: for unknown names, a competitor that does not act, a scenario that is held out, a data set that
             exists already, a folder that cannot be written to, or without Minari. Then nothing is written.
@@ -119,7 +110,7 @@ def write_datasets(
 
 
 class DatasetPlan(NamedTuple):
-    """Checked plan of data sets: experiment, policies and names; writing it raises errors of the folder only."""
+    """Checked plan of data sets, whose writing raises errors of the folder only."""
 
     experiment: Experiment
     """Experiment of the episodes."""
@@ -134,14 +125,14 @@ class DatasetPlan(NamedTuple):
 
     @property
     def decisions(self) -> int:
-        """Number of decisions in all data sets."""
+        """Number of decisions (actions) in all data sets."""
         tasks = [policy.model.task for policy in self.policies]
         return len(self.seeds) * sum(task.horizon // task.decision_interval for task in tasks)
 
     def write(
         self, folder: Path | None = None, namespace: str | None = None, progress: Progress | None = None
     ) -> list[DatasetSummary]:
-        """Write the data sets; arguments, result and errors as of :func:`write_datasets`."""
+        """Write the planned data sets; arguments, result and errors as of :func:`write_datasets`."""
         from minari.storage import get_dataset_path
 
         root = Path(folder) if folder is not None else get_dataset_path()
@@ -190,11 +181,7 @@ def plan_datasets(
 ) -> DatasetPlan:
     """Check all arguments of a request for data sets, and return the plan to write them.
 
-    Args:
-        problem: problem of the policies.
-        experiment: experiment on it; its keywords may also contain ``reward`` and ``dtype`` of ``gymnasium.make``.
-        policies: names or paths; errors are those of :func:`write_datasets`.
-        trust: whether to load a model's zip, which can execute code.
+    Errors are those of :func:`write_datasets`.
     """
     try:
         import h5py  # noqa: F401  (Minari reports that it is missing only when it writes)
@@ -227,7 +214,7 @@ def plan_datasets(
 
 
 def _has_any_control(maker: Any) -> bool:
-    """Return whether a policy can act in any control: it declares neither control nor action space."""
+    """Return whether a policy declares neither control nor action space, and so can act in any control."""
     return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
 
 
@@ -256,13 +243,12 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
 
 
 def _minari_name(text: str) -> str:
-    """Return a text with hyphens for all characters that Minari rejects in a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Set the folder of Minari's data sets, inside a ``with`` block."""
+    """Set the folder in which Minari stores data sets, inside a ``with`` block."""
     variable = "MINARI_DATASETS_PATH"
     before = os.environ.get(variable)
     os.environ[variable] = str(folder.absolute())
@@ -312,7 +298,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
 
 
 def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
-    """Store the mean returns of score 0 and 1 of ``minari.get_normalized_score`` in data sets with random actions."""
+    """Store in each data set the mean returns that ``minari.get_normalized_score`` maps to 0 and 1."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]
         low = next((other.mean_return for other in alike if other.policy == RANDOM), None)
@@ -323,7 +309,7 @@ def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> N
 
 
 def datasets_table(summaries: Iterable[DatasetSummary]) -> Table:
-    """Return a table of written data sets for the terminal, grouped by environment."""
+    """Return a table of written data sets for the terminal: environment, size and mean return."""
     table = plain_table()
     table.add_column("data set", overflow="fold")
     table.add_column("environment", overflow="fold")

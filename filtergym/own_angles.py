@@ -1,4 +1,4 @@
-"""Angles of a state-space model: declared ones, and undeclared ones whose functions remove whole turns."""
+"""Angles of a user's state-space model: declared ones, and undeclared ones that jump by whole turns."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -23,13 +23,9 @@ HALVINGS = 30
 def find_periods(
     angles: Any, names: Sequence[str], places: Sequence[int | None], channels: Sequence[Channel]
 ) -> dict[int, float]:
-    """Return the period of each component that is an angle, by its index: declared, or measured as an angle.
+    """Return the period of each state component that is an angle, declared or measured as one, by its index.
 
-    Args:
-        angles: unit of each declared angle, by the component's name.
-        names: names of all components.
-        places: component that each number of a measurement measures, or None.
-        channels: the sensors.
+    ``places`` are the components that the numbers of a measurement measure, or None.
 
     Raises:
         ValueError: for an unknown component or unit.
@@ -92,7 +88,7 @@ def _warn(text: str) -> None:
 
 
 def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dict[int, str]:
-    """Return the unit, "rad" or "deg", of each row of a function that jumps by a turn, by row number."""
+    """Return the unit, "rad" or "deg", of each row of a function that jumps by a whole turn."""
     found: dict[int, str] = {}
     for place in range(n):
         for step, count in STEPS:

@@ -14,7 +14,7 @@ LONGEST = 1e4
 
 
 class Discretised(NamedTuple):
-    """A discrete-time model for any interval."""
+    """A discrete-time model for any interval: motion and covariance of the process noise."""
 
     motion: Callable[[Any, Any, Any], Any]
     """State ``(n,)`` after the interval, from state, interval and inputs ``(p,)``."""

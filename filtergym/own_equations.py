@@ -26,7 +26,7 @@ FAR = 3.0
 
 
 class NoiseBlock(NamedTuple):
-    """The noise of some of the measured numbers, independent of that of all others."""
+    """Covariance R of some of the measured numbers, independent of that of all others."""
 
     what: str
     """Name of the noise, in errors."""
@@ -37,7 +37,7 @@ class NoiseBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """The state, interval and inputs that the equations of a model must fit."""
+    """State, interval and inputs that the equations of a user's model must fit."""
 
     mean: numpy.ndarray
     """Mean of the initial state, ``(n,)``."""
@@ -50,7 +50,7 @@ class Surroundings:
 
     @property
     def nominal_inputs(self) -> numpy.ndarray:
-        """Means of the distributions of the inputs, ``(p,)``."""
+        """Mean of each input in a simulation, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
 
@@ -82,11 +82,7 @@ def make_model(equations: Mapping[str, Any], around: Surroundings) -> StateSpace
 def _sensor_noise(
     blocks: Sequence[NoiseBlock], around: Surroundings, timed: bool
 ) -> numpy.ndarray | VectorFunction:
-    """Return R of all sensors: a matrix ``(m, m)``, or a traced function of state, interval and inputs.
-
-    Raises:
-        ValueError: for a block that is no covariance, cannot be traced, or takes an argument that does not exist.
-    """
+    """Return R of all sensors: a matrix ``(m, m)``, or a traced function of state, interval and inputs."""
     n, further, size = len(around.mean), int(timed), sum(block.size for block in blocks)
     ends = numpy.cumsum([0, *(block.size for block in blocks)]).tolist()
     takes = [_noise_arguments(block, around, timed) for block in blocks]
@@ -124,11 +120,7 @@ def _matrix(R: Any) -> Any:
 
 
 def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tuple[str, ...]:
-    """Return the argument names of a block's function R, of x, dt and u, in its order; empty for a matrix.
-
-    Raises:
-        ValueError: for an argument that the model does not have.
-    """
+    """Return which of x, dt and u a block's function R takes, in its order; empty for a matrix."""
     if not callable(block.R):
         return ()
     names = arguments(block.R) or ("x",)
@@ -148,7 +140,7 @@ def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tu
 
 
 def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], around: Surroundings) -> None:
-    """Raise ValueError for a function R that is no covariance at the initial mean and the inputs of a simulation."""
+    """Raise ValueError if a function R is no covariance at the initial mean and likely inputs."""
     if not isinstance(model.R, VectorFunction):
         return
     deviations = numpy.array([one.deviation for one in around.inputs.values()])
@@ -172,7 +164,7 @@ def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], ar
 
 
 class _Motion(NamedTuple):
-    """Motion of the state: f, G and Q of a :class:`StateSpaceModel`."""
+    """Motion of the state: f, G, Q and its sources, as in :class:`StateSpaceModel`."""
 
     f: VectorFunction
     G: VectorFunction | None
@@ -213,11 +205,7 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
 
 def _sources(what: str, given: Any) -> Mapping[str, Any]:
-    """Return covariances of process noise by the names of their sources; a single one has the name "".
-
-    Raises:
-        ValueError: for no source, or an invalid name.
-    """
+    """Return covariances of process noise by the names of their sources; a single one has the name ""."""
     if not isinstance(given, Mapping):
         return {"": given}
     if not given or not all(isinstance(name, str) and name for name in given):
@@ -263,7 +251,7 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 def _with_inputs(
     what: str, call: Callable[[Any, Any, Any], Any], timed: bool, around: Surroundings
 ) -> tuple[VectorFunction, VectorFunction | None]:
-    """Return the motion, traced twice: as a function of the state first, and of noisy inputs first, or None."""
+    """Return the motion traced as a function of the state first, and of the noisy inputs first (None: none)."""
     n, p = len(around.mean), len(around.inputs)
     further = int(timed)  # the interval stands between state and inputs, or nothing does
     of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
@@ -289,7 +277,7 @@ def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
 
 
 def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> VectorFunction | None:
-    """Return h traced as a function of the inputs first, for their noise; None if no noisy input acts on it."""
+    """Return the measurement h traced as a function of the inputs first; None if no noisy input acts on it."""
     p = len(around.inputs)
     if not callable(h) or not traced.given or not any(one.noise > 0.0 for one in around.inputs.values()):
         return None
@@ -302,7 +290,7 @@ def further_arguments(function: Any) -> tuple[str, ...]:
 
 
 def arguments(function: Any) -> tuple[str, ...]:
-    """Return the names of a function's arguments; empty for other objects, and without a signature."""
+    """Return the argument names of a function; empty if it is none, or has no signature."""
     if not callable(function):
         return ()
     try:
@@ -312,7 +300,7 @@ def arguments(function: Any) -> tuple[str, ...]:
 
 
 def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
-    """Return values as an array; raise ValueError unless they are finite and of the shape (None: any size)."""
+    """Return values as an array; raise ValueError unless finite and of the shape, where None is any size."""
     array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if fits and not numpy.isfinite(array).all():
@@ -336,9 +324,9 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
 
 
 def trace(what: str, function: Function, size: int, results: int | None, further: int = 0) -> VectorFunction:
-    """Return a function, traced, of ``size`` numbers and ``further`` ones without derivative.
+    """Return the traced form of a function of ``size`` numbers, and of ``further`` ones without derivative.
 
-    It must return ``results`` numbers; None: any number of them.
+    The function has ``results`` results; None: any number of them.
 
     Raises:
         ValueError: if it cannot be traced, or returns another number of results.

@@ -241,7 +241,7 @@ def _sequence(what: str, given: Any) -> tuple[Any, ...]:
 def _sensors(
     sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]
 ) -> dict[str, Sensor]:
-    """Return the sensors by name; empty for a model with h and R instead.
+    """Return the sensors of a model by name; empty for a model with h and R instead.
 
     Raises:
         ValueError: if neither is given, or both.
@@ -268,7 +268,7 @@ def _check_motion(first: Mapping[str, Any]) -> None:
 
 
 def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return equations by name with some of them replaced; raise ValueError for an unknown name."""
+    """Return a model's equations by name, some of them replaced; raise ValueError for an unknown name."""
     own = first["sensors"]
     unused = {*(("h", "R") if own else ("sensors",))}
     unused |= {"f", "Q"} if first["f"] is None else {"drift", "diffusion"}
@@ -296,7 +296,7 @@ def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -
 
 
 def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
-    """Return equations with h and R stacked from all sensors; unchanged without sensors."""
+    """Return a model's equations with h and R stacked from all its sensors; unchanged without sensors."""
     if not given["sensors"]:
         return given
     h, R = stack_sensors(given["sensors"], size, inputs)
@@ -304,7 +304,7 @@ def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
 
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
-    """Return inputs as :class:`Input` by name; raise ValueError for an invalid one."""
+    """Return a model's inputs as :class:`Input` by name; raise ValueError for an invalid one."""
     is_list = isinstance(given, Mapping | Sequence) and not isinstance(given, str)
     if not is_list or not all(isinstance(name, str) for name in given):
         raise ValueError(
@@ -331,12 +331,7 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
 
 
 class _EstimatedReward:
-    """Reward of a user's model, whose unit is estimated by simulation on first use, in 0.1 to 0.5 s.
-
-    Args:
-        cls: class of the task.
-        parameters: parameters of the registered class.
-    """
+    """Reward of a user's model, whose unit is estimated by simulation on first use, in 0.1 to 0.5 s."""
 
     cost, kind, log_unit = StateSpace.reward.cost, StateSpace.reward.kind, None
 
@@ -345,12 +340,11 @@ class _EstimatedReward:
 
     @functools.cached_property
     def unit(self) -> float:
-        """Typical cost of an episode, the median over some episodes."""
         return _typical_cost(self._cls, self._parameters)
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
-    """Return the median episode cost of the model's filter, to two digits; 1 if it is zero or not finite."""
+    """Return the median episode cost of the model's filter in a simulation, to two digits; 1 if unusable."""
     model: Any = Model(cls(parameters), cls.paper_policy.control)
     episodes, measurements = TRIED
     share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3

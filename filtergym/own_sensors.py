@@ -18,7 +18,7 @@ NOISES = ("process", "measurement")
 
 
 def replace_sensors(sensors: Mapping[str, Sensor] | None, replacements: Any) -> dict[str, Sensor]:
-    """Return sensors by name, some of them replaced; None in place of ``sensors`` allows any name.
+    """Return sensors by name with some replaced; None in place of ``sensors`` allows any name.
 
     Raises:
         ValueError: for an object that is no sensor, or an unknown name.
@@ -40,10 +40,10 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, replacements: Any) -> 
 
 
 def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, list[NoiseBlock]]:
-    """Return h of all sensors stacked, and the noise of each, for a state of ``size`` numbers.
+    """Return the stacked measurement function h of all sensors, and the noise block of each.
 
     Raises:
-        ValueError: for sensors that do not fit.
+        ValueError: for sensors that do not fit a state of ``size`` numbers and ``inputs`` inputs.
     """
     R, traced = [], []
     for name, one in sensors.items():
@@ -67,11 +67,6 @@ def find_channels(
     sensors: Mapping[str, Sensor], counts: Sequence[int], interval: float
 ) -> tuple[Channel, ...]:
     """Return a :class:`Channel` for each sensor: its places in the measurement, period, availability and gate.
-
-    Args:
-        sensors: sensors by their names; empty: one sensor measures everything.
-        counts: number of measured numbers of each sensor.
-        interval: time between measurements, s.
 
     Raises:
         ValueError: for a sensor whose interval is shorter than ``interval``.
@@ -112,7 +107,7 @@ def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -
 
 
 def check_columns(names: Sequence[str], count: int, inputs: Iterable[str]) -> None:
-    """Raise ValueError unless ``names`` are ``count`` different column names, distinct from inputs, time and truth."""
+    """Raise ValueError unless ``names`` are ``count`` distinct columns that no input, time or truth has."""
     lower = [str(name).lower() for name in (*names, *inputs)]
     if len(names) != count or len({*lower}) != len(lower) or {*lower} & {*TIME, *RESERVED, ""}:
         raise ValueError(

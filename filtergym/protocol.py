@@ -27,9 +27,9 @@ from .envs.engine.catalogue import bare_name, nearest
 from .evaluation.competitors.kinds import RANKED, kind_of
 from .evaluation.running.metrics import Record
 from .evaluation.running.parallel import Workers
-from .evaluation.running.rollout import ProcessorTime, Progress
+from .evaluation.running.rollout import Progress
 from .evaluation.running.summary import EvaluationRequest, Summary, combine_summaries, summaries
-from .evaluation.running.times import times_of_records
+from .evaluation.running.times import ProcessorTime, times_of_records
 from .evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, share_interval
 from .names import find_competitor
 
@@ -40,7 +40,7 @@ MOST_BYTES = 100_000
 
 
 class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One environment of a protocol: version, paper's algorithm and scenarios."""
+    """One environment of a protocol: its id and version, paper's algorithm and scenarios."""
 
     id: str
     """Gymnasium id."""
@@ -62,7 +62,7 @@ class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a protocol file."""
+    """Content of a protocol file: environments, split, seed and episodes."""
 
     name: str
     year: int
@@ -86,13 +86,10 @@ def protocol_names() -> list[str]:
 
 
 def read_protocol(name: str) -> tuple[Protocol, str]:
-    """Return a protocol, read from its file and checked, and the file's digest.
+    """Return a protocol, read from its file and checked, and the SHA-256 digest of the file.
 
     Args:
         name: name of one of this package, or the path of a ``.toml``.
-
-    Returns:
-        The protocol, and the SHA-256 digest of the file.
 
     Raises:
         ValueError: for another name, a file that is no protocol, or one with another interface, bound, bootstrap or
@@ -202,7 +199,7 @@ def _find_entry(own: ProtocolEnvironment, name: str, trust: bool, rename: Any) -
 
 
 class EnvironmentResult(NamedTuple):
-    """Result of a competitor in one environment of a protocol."""
+    """Result of a competitor in one environment of a protocol: cost, lost tracks, ANEES, time."""
 
     entry: Entry
     cost: IntervalEstimate
@@ -221,14 +218,14 @@ class EnvironmentResult(NamedTuple):
 
     @property
     def logarithms(self) -> numpy.ndarray:
-        """Logarithms of the cost ratios of the episodes of the training distribution, ``(episodes,)``."""
+        """Logarithms of the cost ratios to the paper's algorithm in the training distribution, ``(episodes,)``."""
         own = self.entry.environment
         costs = self.costs[own.training]
         return numpy.log(costs[self.entry.name] / costs[own.paper])
 
 
 class ProtocolResult(NamedTuple):
-    """Results of the entries of a protocol, and its number."""
+    """Result of the competitors entered in a protocol, in each environment and as one number."""
 
     protocol: Protocol
     digest: str
@@ -243,14 +240,14 @@ class ProtocolResult(NamedTuple):
         return ", ".join(dict.fromkeys(one.entry.name for one in self.environments))
 
     @property
-    def complete(self) -> bool:
-        """Whether every environment of the protocol has an entry; otherwise there is no number."""
+    def is_complete(self) -> bool:
+        """Whether every environment of the protocol has an entry, without which there is no overall number."""
         return len(self.environments) == len(self.protocol.environments)
 
     @property
     def cost(self) -> IntervalEstimate | None:
         """Geometric mean over the environments of the cost ratios, less one, with interval; None if not complete."""
-        if not self.complete:
+        if not self.is_complete:
             return None
         bootstrap = Bootstrap(self.protocol.episodes, self.protocol.resamples)
         logarithms = numpy.stack([one.logarithms for one in self.environments], axis=1)
@@ -259,13 +256,13 @@ class ProtocolResult(NamedTuple):
     @property
     def lost(self) -> float | None:
         """Mean over the environments of the share of lost tracks; None if not complete."""
-        return float(numpy.mean([one.lost.value for one in self.environments])) if self.complete else None
+        return float(numpy.mean([one.lost.value for one in self.environments])) if self.is_complete else None
 
     @property
     def time(self) -> ProcessorTime | None:
         """Geometric mean over the environments of the time of a measurement; None if it is unknown in any of them."""
         times = [one.time for one in self.environments if one.time is not None]
-        if not self.complete or len(times) < len(self.environments):
+        if not self.is_complete or len(times) < len(self.environments):
             return None
         mean = math.exp(sum(math.log(time.nanoseconds) for time in times) / len(times))
         return ProcessorTime(mean, all(time.compiled for time in times), any(time.own for time in times))
@@ -308,12 +305,12 @@ def run_protocol(
 
 
 def measurements_of(protocol: Protocol, entries: Sequence[Entry]) -> int:
-    """Return the number of measurements that a run of the protocol simulates, over all competitors."""
+    """Return the number of measurements that a run of a protocol simulates, over all competitors."""
     return sum(one.measurements for e in entries for cell in _cells(protocol, e, {}) for one in cell)
 
 
 def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iterator[list[EvaluationRequest]]:
-    """Yield the evaluation requests of each scenario: the paper's algorithm, references, and the competitor."""
+    """Yield the evaluation requests of each scenario of an entry: paper's algorithm, references, competitor."""
     own = entry.environment
     problem = problem_of(own.id)
     makers = {name: problem.competitor(name) for name in (own.paper, *entry.references)}
@@ -372,12 +369,7 @@ def _costs(found: Sequence[Summary]) -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def bib_entry(result: ProtocolResult, version: str) -> str:
-    """Return a BibTeX entry that cites the protocol of a result.
-
-    Args:
-        result: result to quote.
-        version: version of the package.
-    """
+    """Return a BibTeX entry that cites the protocol of a result, and the version of the package."""
     protocol = result.protocol
     ids = ", ".join(own.short for own in protocol.environments)
     fields = {

@@ -1,9 +1,9 @@
 """Submissions: a competitor and its results on a protocol in one file that any user can run again.
 
-A file is JSON of declared types. Nothing in it is compressed, so that its size is known, and nothing in it
-names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source
-text, which runs only where the reader trusts it, and then in a process that receives the measurements only
-(:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
+A file is JSON of declared types, not compressed, and names no file. An agent is its arrays
+(:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source text, which runs only where the reader
+trusts it, in a process that receives the measurements only (:mod:`.evaluation.competitors.isolation`). A competitor of
+this package is its name.
 
 A second run of a file gives the same numbers but for rounding: the noise of an episode is a function of its seed.
 Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
@@ -12,14 +12,13 @@ matrices that it inverts, so that costs differ by about n * kappa * u: of n = 30
 :data:`TOLERANCE` is the next power of ten.
 
 The seeds of a protocol are public, and a competitor can carry the truth of its episodes. So a verification also runs
-the protocol on fresh episodes, from a seed that did not exist when the file was written, and compares both results
-number by number. The interval of a difference of independent numbers a in [a_l, a_u] and b in [b_l, b_u] with a > b has
-the half-width sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner,
-Construction of confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are
-stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance rejects
-about the share :data:`ALARM` of correct submissions. Over 32 episodes intervals are somewhat short: of pairs of batches
-up to six in 10,000 were rejected in the five environments. The geometric mean of ratios of costs is compared by its
-logarithm.
+fresh episodes, from a seed that did not exist when the file was written, and compares both results number by number.
+The interval of a difference of independent numbers a in [a_l, a_u] and b in [b_l, b_u] with a > b has the half-width
+sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner, Construction of
+confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are stretched to the
+confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance rejects about the share
+:data:`ALARM` of correct submissions; over 32 episodes up to six in 10,000 were rejected in the five environments. The
+geometric mean of ratios of costs is compared by its logarithm.
 """
 
 import hashlib
@@ -94,18 +93,18 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of the parts of a submission's file; further members are errors."""
+    """Base of the parts of a submission's file; unknown members are errors."""
 
 
 class Card(_Stored, frozen=True):
-    """The author's description of a submission."""
+    """The author's description of a submission: title and author."""
 
     title: Title
     author: Title = "-"
 
 
 class Figure(_Stored, frozen=True, omit_defaults=True):
-    """One number of the results, with its 95 % interval over the episodes."""
+    """One number of a submission's results, with its 95 % interval over the episodes."""
 
     scenario: Name
     metric: Name
@@ -116,26 +115,26 @@ class Figure(_Stored, frozen=True, omit_defaults=True):
 
 
 class Arrays(_Stored, frozen=True, tag="arrays"):
-    """An agent: a safetensors file as ``filtergym export`` writes it."""
+    """Competitor of a submission that is an agent: a safetensors file as ``filtergym export`` writes it."""
 
     safetensors: bytes
 
 
 class Source(_Stored, frozen=True, tag="source"):
-    """An estimator: one file of Python, and the name of the class in it. It runs in a process of its own."""
+    """Competitor of a submission that is an estimator: one Python file, and the name of the class in it."""
 
     text: str
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_]\w{0,99}\Z")]
 
 
 class Shipped(_Stored, frozen=True, tag="shipped"):
-    """A classical competitor of this package."""
+    """Competitor of a submission that this package ships: its name."""
 
     name: Name
 
 
 class Submission(_Stored, frozen=True):
-    """Content of a file."""
+    """Content of a submission's file: competitor, protocol, description and results."""
 
     environment: Name
     """Gymnasium id."""
@@ -179,13 +178,10 @@ def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
 
 
 def read_submission(path: Path) -> tuple[Submission, str]:
-    """Return the submission in a file, without running any of it, and the file's digest.
+    """Return the submission in a file, without running any of it, and the file's SHA-256 digest.
 
     Args:
         path: path of the file.
-
-    Returns:
-        The submission, and the SHA-256 digest of the file.
 
     Raises:
         ValueError: if the file is no submission.
@@ -195,7 +191,7 @@ def read_submission(path: Path) -> tuple[Submission, str]:
 
 
 def write_submission(path: Path, submission: Submission) -> str:
-    """Write a submission, and return the SHA-256 digest of the file.
+    """Write a submission to a file, and return the SHA-256 digest of the file.
 
     Args:
         path: path of the file.
@@ -274,13 +270,7 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
 
 
 def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
-    """Return the maker of the competitor in a submission: agent, source code or shipped filter.
-
-    Args:
-        problem: problem of the submission.
-        submission: submission from a file.
-        path: path of the file, for errors.
-        trust: whether to run source code.
+    """Return the factory of the competitor in a submission: agent, source code or shipped filter.
 
     Raises:
         ValueError: if it contains source code and is not trusted; for an object that is no competitor, a competitor
@@ -309,12 +299,7 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
 
 
 def _load_agent(problem: Problem, arrays: Arrays, path: Path) -> Any:
-    """Return the agent of a submission, loaded from its arrays.
-
-    Raises:
-        ValueError: in one printable sentence that names the submission, if the arrays are no agent of the environment,
-            or it was trained on held-out data.
-    """
+    """Return the agent of a submission, loaded from its arrays."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "agent.safetensors"
         file.write_bytes(arrays.safetensors)
@@ -330,11 +315,7 @@ def _load_agent(problem: Problem, arrays: Arrays, path: Path) -> Any:
 
 
 def _check_trained(problem: Problem, scenario: Any) -> None:
-    """Raise ValueError unless an agent was trained on one or several training scenarios of the environment.
-
-    Raises:
-        ValueError: for a scenario that is held out, or none.
-    """
+    """Raise ValueError unless an agent was trained on training scenarios of the environment alone."""
     for name in find_mixture(problem.task, scenario) or [scenario or problem.task.default_scenario]:
         if not (isinstance(name, str) and name in problem.task.scenarios):
             raise nearest("scenario", name, problem.task.scenarios)
@@ -376,11 +357,7 @@ def make_submission(
 
 
 def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
-    """Check a submission's protocol and digest against this package, without running it; return the protocol.
-
-    Raises:
-        ValueError: for a protocol that is not this package's.
-    """
+    """Return a submission's protocol, after a check of its digest against this package's."""
     protocol, digest = protocol_of(problem, submission.protocol)
     if submission.protocol_sha256 != digest:
         raise ValueError(
@@ -390,7 +367,7 @@ def check_submission(problem: Problem, submission: Submission, path: Path) -> Pr
 
 
 class Suspicion(NamedTuple):
-    """A cost significantly below that of a reference, which knows more than the sensors measure."""
+    """Suspicion that a competitor knows the truth: its cost is significantly below a reference's."""
 
     scenario: str
     reference: str
@@ -421,15 +398,8 @@ def run_submission(
 ) -> Run:
     """Run the competitor of a submission over the scenarios of its protocol, and return the results.
 
-    Args:
-        problem: problem of the submission.
-        submission: submission from a file.
-        path: path of the file, for errors.
-        trust: whether to run source code.
-        workers: processes that share the work.
-        progress: function that is called with the number of measurements done.
-        seed: seed of other episodes than those of the protocol; None: those of the protocol.
-        references: whether to run the reference of the environment, too, and compare costs with it.
+    ``seed`` is that of other episodes than the protocol's; with ``references`` costs are compared with the
+    environment's reference.
 
     Raises:
         ValueError: as :func:`check_submission` and :func:`unpack`.
@@ -449,13 +419,7 @@ def run_submission(
 def _suspicions(
     problem: Problem, references: Sequence[str], costs: Mapping[str, Mapping[str, numpy.ndarray]]
 ) -> Iterator[Suspicion]:
-    """Yield a suspicion for each reference and scenario of significantly higher cost (paired t-test).
-
-    Args:
-        problem: problem of the references.
-        references: their names.
-        costs: costs of every episode, by scenario and competitor.
-    """
+    """Yield a suspicion for each reference and scenario of significantly higher cost (paired t-test)."""
     critical = _critical(len(references) * len(costs))
     for name in references:
         for scenario, own in costs.items():
@@ -473,7 +437,7 @@ def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator
 
 
 class Deviation(NamedTuple):
-    """The largest deviation of claimed results from those of a second run."""
+    """The largest deviation of a submission's results from those of a second run, over the allowed one."""
 
     size: float
     """Size in units of what rounding, or on fresh episodes chance, explains; infinite where one of both has
@@ -488,7 +452,7 @@ class Deviation(NamedTuple):
 
 
 def deviation(claimed: Sequence[Figure], repeated: Sequence[Figure]) -> Deviation:
-    """Return the largest deviation of results from a second run over the same episodes; times are not compared.
+    """Return the largest deviation of results from a second run over the same episodes, without times.
 
     Args:
         claimed: results of a file.
@@ -551,7 +515,7 @@ def _numbers(figure: Figure) -> tuple[float | None, float | None, float | None]:
 
 
 def _critical(count: int) -> float:
-    """Return how many standard errors contain all of ``count`` normal numbers with probability ``1 - ALARM``."""
+    """Return how many standard errors contain all of ``count`` normal numbers, with probability 1 - ``ALARM``."""
     return statistics.NormalDist().inv_cdf(1.0 - 0.5 * ALARM / max(count, 1))
 
 
@@ -582,7 +546,7 @@ def _number(value: float | None) -> str:
 
 
 class Verification(NamedTuple):
-    """Results of a verification: deviations on the same and on fresh episodes, and suspicions."""
+    """Result of a verification of a submission: deviations on the same and on fresh episodes, suspicions."""
 
     submission: Submission
     digest: str
@@ -600,7 +564,7 @@ class Verification(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the results hold: rounding explains the deviation on the same episodes, chance that on fresh ones."""
+        """Whether the claims hold: rounding explains the deviation on the same episodes, chance that on fresh ones."""
         return self.deviation.holds and self.fresh_deviation.holds
 
 

@@ -39,9 +39,7 @@ class Covariance(NamedTuple):
 
 
 def benedict_bordner_beta(alpha: Array) -> Array:
-    """Return the Benedict-Bordner velocity gain for a position gain, ``beta = alpha^2 / (2 - alpha)``.
-
-    Equation (21).
+    """Return the Benedict-Bordner velocity gain ``beta = alpha^2 / (2 - alpha)``, equation (21).
 
     Benedict and Bordner (1962): this relation minimises noise and transient error together.
     """
@@ -73,7 +71,7 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
         P: predicted covariance.
         R: variance of the measurement, m^2.
         alpha: position gain.
-        beta: velocity gain; ``beta / T`` enters the filter.
+        beta: velocity gain.
         T: time since the last measurement, s.
     """
     rate = beta / T
@@ -89,7 +87,7 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
 def add_acceleration_error(
     P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float | Array, since: float | Array = 0.0
 ) -> Covariance:
-    """Return the covariance after an update, increased by the error that an acceleration leaves.
+    """Return an updated covariance plus the error of an acceleration since the previous measurement.
 
     The target accelerates since the previous measurement. An acceleration ``a`` over an interval moves the position by
     ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of which the update (19), (20) leaves ``(1 - alpha) d`` and
@@ -132,9 +130,9 @@ def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: fl
 
     Args:
         P: predicted covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
-        R: measurement variance of each coordinate, ``(d, ...)``; coordinates are measured independently.
+        R: measurement variance of each coordinate, ``(d, ...)``.
         alpha: position gain, broadcasting against the trailing axes.
-        beta: velocity gain; ``beta / T`` enters the filter.
+        beta: velocity gain.
         T: time since the last measurement, s; one for all, or broadcasting in the same way.
     """
     xp = namespace(P)

@@ -30,5 +30,7 @@ def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Arr
 
 
 def shorten(difference: Array, periods: Mapping[int, float]) -> Array:
-    """Return differences ``(n, ...)`` with their angles within half a turn; ``periods`` by row as in :func:`unwrap`."""
+    """Return differences ``(n, ...)`` with their angles shortened to within half a turn; ``periods`` by row
+    number.
+    """
     return unwrap(difference, 0.0 * difference, periods) if periods else difference

@@ -19,8 +19,7 @@ _BY_TYPE: dict[type, ModuleType] = {numpy.ndarray: numpy}
 def namespace(array: Array) -> ModuleType:
     """Return the array API namespace of an array: NumPy or that of torch.
 
-    NumPy 2 implements the standard itself. Asking ``array_api_compat`` costs as much as three small array
-    operations, and ``torch.compile`` cannot follow it, so the result is stored by type.
+    The result is stored by type: asking ``array_api_compat`` costs as much as three small array operations.
     """
     kind = type(array)
     if kind not in _BY_TYPE:
@@ -29,14 +28,14 @@ def namespace(array: Array) -> ModuleType:
 
 
 def lane_arrays(values: Any) -> list[Array]:
-    """Return a list of the arrays with axes in nested lists of numbers and arrays."""
+    """Return a flat list of the arrays ``(..., N)`` in nested lists, without plain numbers."""
     if isinstance(values, list | tuple):
         return [array for value in values for array in lane_arrays(value)]
     return [values] if getattr(values, "ndim", 0) else []
 
 
 def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
-    """Return nested lists of numbers and arrays ``(N,)`` as one array ``(..., N)``.
+    """Stack nested lists of numbers and arrays ``(N,)`` into one array ``(..., N)``.
 
     Args:
         values: nested lists.
@@ -49,12 +48,12 @@ def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
 
 
 def zeros_for(shape: Sequence[int], *parts: Any) -> numpy.ndarray:
-    """Return a NumPy array of zeros whose type can store entries of the parts, which may be traced expressions."""
+    """Return a NumPy array of zeros whose type (float or wider) can store the values of ``parts``."""
     return numpy.zeros(shape, numpy.result_type(float, *map(numpy.asarray, parts)))
 
 
 def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
-    """Return nested tuples and dictionaries with a function applied to each of their arrays; None stays None."""
+    """Apply a function to each array of nested tuples and dictionaries, which may contain None."""
     first = parts[0]
     if first is None:
         return None
@@ -67,12 +66,14 @@ def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
 
 
 def select_nested(which: Array, one: Any, other: Any) -> Any:
-    """Return nested arrays ``(..., N)`` with entries of ``one`` where a mask ``(N,)`` is true, else of ``other``."""
+    """Return nested arrays ``(..., N)``: those of ``one`` in lanes where a mask ``(N,)`` is true, else of
+    ``other``.
+    """
     return map_nested(functools.partial(namespace(which).where, which), one, other)
 
 
 def is_tensor(values: Any) -> bool:
-    """Return whether a value is a torch tensor, without importing torch."""
+    """Return whether a value is a torch tensor; torch is not imported."""
     return type(values).__module__.partition(".")[0] == "torch"
 
 

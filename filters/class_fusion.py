@@ -13,12 +13,11 @@ class may jump with probabilities q(s(k) | s(k-1)). One cycle, in the order of (
     5  output                                                            x, R                (11), (12)
 
 Steps 1 to 3 are :func:`advance`, 4 is :func:`~filtergym.filters.imm.mode_posterior`, 5 is
-:func:`~filtergym.filters.imm.combine`. An IMM mixes before it predicts; here mixing ends the cycle, because
-(8)-(10) write every factor of the motion as a function of s(k-1). The two differ in whether an ESM decision
-judges the class before or after a jump.
+:func:`~filtergym.filters.imm.combine`. An IMM mixes before it predicts; here mixing ends the cycle, so that
+an ESM decision judges the class after a jump.
 
 With a constant class, q = identity, nothing mixes: a bank of Kalman filters whose covariances and gains do
-not depend on the data (:func:`design_channels`), and :func:`update_channels` is all that is left to do.
+not depend on the data (:func:`design_channels`, :func:`update_channels`).
 
 Reading: the first sum of (8) is over s(k-1), for a fixed s(k). The type probabilities of a class are
 pi(rho | s) = sum_j pi(rho | type j) P(type j | s).
@@ -141,10 +140,7 @@ def _solve_upper(L: list[list[Array]], B: Array) -> Array:
 
 
 class Channels(NamedTuple):
-    """Gains, covariances and innovation statistics of Kalman filters of constant classes, for scans 0 to K.
-
-    They do not depend on the data.
-    """
+    """Gains, covariances and innovation statistics of filters of constant classes, for every scan."""
 
     gain: Array
     """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""
@@ -157,7 +153,7 @@ class Channels(NamedTuple):
 
 
 def design_channels(models: Models, start: numpy.ndarray, scans: int) -> Channels:
-    """Return gains, covariances and innovation statistics of the Kalman filters of all classes, for K scans.
+    """Compute gains, covariances and innovation statistics of the Kalman filters of all classes, for K scans.
 
     Args:
         models: models of the classes, NumPy arrays.
@@ -221,20 +217,17 @@ def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -
 def add_coloured_errors(
     models: Models, start: numpy.ndarray, share: float, decay: float
 ) -> tuple[Models, numpy.ndarray]:
-    """Return the models and covariances of states augmented by the radar's coloured errors; NumPy arrays.
+    """Return motion models and start covariances of states augmented by coloured errors of the radar; NumPy
+    arrays.
 
-    With x the state and e the errors, ``e(k) = decay e(k-1) + w``, the new state is (x + H^T e, e): each measured
-    component includes its error, so that measurements are the first m components and white errors. At the start these
-    components are those of a measurement.
+    With x the state and e the errors, ``e(k) = decay e(k-1) + w``, the new state is (x + H^T e, e): each
+    measured component includes its error, so that measurements are the first m components and white errors.
 
     Args:
         models: models of the classes, with ``H = [I 0]``.
         start: covariances at scan 0, ``(n, n, M)``.
         share: variance of a coloured error over that of the white one.
         decay: factor on the coloured error from scan to scan.
-
-    Returns:
-        The models and the covariances, of n + m states.
     """
     n, m = start.shape[0], models.H.shape[0]
     white = numpy.diagonal(models.R)
@@ -304,13 +297,11 @@ def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_compo
 
 
 def change_class_and_type(log_joint: Array, log_composition: Array, change: float) -> Array:
-    """Return the log-probabilities of class and type after a possible change of the class, ``(M, J, N)``.
+    """Return log-probabilities of class and type after a possible class change, with a new type,
+    ``(M, J, N)``.
 
-    A new class has its own type.
-
-    ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8), for a type
-    that changes only together with the class. It is the prediction of Bayes' rule for a hidden Markov chain. Old
-    evidence loses weight.
+    ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8),
+    for a type that changes only together with the class.
 
     Args:
         log_joint: log P(s, j), up to a constant, ``(M, J, N)``.

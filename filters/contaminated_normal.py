@@ -11,8 +11,8 @@ moments (the Gaussian-sum update of H. W. Sorenson and D. L. Alspach, Automatica
 The spread of the means is in (2): a measurement that may be an outlier enlarges the covariance. For g = 0 both are
 Kalman's.
 
-(2) is the short form: its rounding is relative to P', not to P. Jumps of 3000 standard deviations, after which merged
-covariances are ten million times R, leave P positive definite; jumps of 10 000 did not.
+(2) is the short form: its rounding is relative to P', not to P. P stays positive definite after jumps of 3000
+standard deviations, not of 10 000.
 
 Shapes: states ``(n, ...)``, batch last.
 """

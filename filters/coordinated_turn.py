@@ -109,7 +109,7 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
 
 
 def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
-    """Return mean ``(5, N)`` and covariance of position and velocity, with an independent turn rate of mean zero.
+    """Append an independent turn rate of mean zero to mean and covariance of position and velocity.
 
     Args:
         mean: mean of position and velocity, ``(4, N)``.

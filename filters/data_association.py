@@ -14,9 +14,9 @@ nu_i = z_i - H x' and S_i = H P' H^T + R_i,
     x = x' + P_xz d,  d = sum_i beta_i S_i^-1 nu_i                                                             (3)
     P = P' - P_xz (sum_i beta_i S_i^-1 - sum_i beta_i S_i^-1 nu_i nu_i^T S_i^-1 + d d^T) P_zx                  (4)
 
-(3) and (4) are the moments of the mixture of all associations: the spread of the means is in (4). The logarithm of the
-sum of the right sides of (2) is the likelihood ratio of the plots to false ones alone, by which hypotheses about the
-motion are weighed. No gate cuts N off: plots from far away get no weight.
+(3) and (4) are the moments of the mixture of all associations: the spread of the means is in (4). The
+logarithm of the sum of the right sides of (2) is the likelihood ratio of the plots to false ones alone, by
+which hypotheses about the motion are weighed.
 
 Y. Bar-Shalom and E. Tse, Tracking in a cluttered environment with probabilistic data association, Automatica 11 (1975),
 451-460; Y. Bar-Shalom and T. E. Fortmann, Tracking and Data Association (1988), sections 6.3 and 6.4, also for lambda
@@ -59,7 +59,7 @@ def squared_distances(position: Array, covariance: Array, plots: Array, variance
         position: predicted position, ``(2, ...)``.
         covariance: its covariance, ``(2, 2, ...)``.
         plots: positions of the plots, ``(2, K, ...)``.
-        variances: variances R of their errors, which are independent, ``(2, K, ...)``.
+        variances: variances R of their errors, ``(2, K, ...)``.
     """
     nu = plots - position[:, None]
     P = covariance[:, :, None]
@@ -70,7 +70,8 @@ def squared_distances(position: Array, covariance: Array, plots: Array, variance
 
 
 def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[Array, Array]:
-    """Return a mask of the plot that is nearest to the prediction, and whether it is in the gate.
+    """Return a mask of the plot nearest to the prediction, all zero where none is in the gate, and whether
+    one is.
 
     Args:
         distances: squared distances, ``(K, N)``.
@@ -78,8 +79,8 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
         gate: largest squared distance.
 
     Returns:
-        One for the nearest plot and zero for the others, ``(K, N)``, all zero where none is in the gate; and whether
-        one is, ``(N,)``. Of plots equally near it is the first.
+        One for the nearest plot and zero for the others, ``(K, N)``, and whether one is in the gate,
+        ``(N,)``. Of plots equally near it is the first.
     """
     xp = namespace(distances)
     least, chosen = gate + 0.0 * distances[0], -1.0 + 0.0 * distances[0]
@@ -93,12 +94,13 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
 def update_position(
     mean: Array, covariance: Array, plots: Plots, detection_probability: float, density: Array
 ) -> Update:
-    """Return the PDA update with all plots of a scan, which measure the first two state components.
+    """Return the PDA update of a track with all plots of a scan, which measure the first two state
+    components.
 
     Args:
         mean: predicted mean, ``(n, ...)``.
         covariance: predicted covariance, ``(n, n, ...)``.
-        plots: plots of the scan; their errors are independent.
+        plots: plots of the scan.
         detection_probability: P_D, probability of detection.
         density: lambda, number of false plots per unit of area, ``(...)``.
 

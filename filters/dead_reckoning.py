@@ -1,24 +1,24 @@
 r"""Positions with slowly varying errors, filtered with dead reckoning from a second sensor.
 
-A receiver's errors last: for minutes they look like motion, and its positions alone do not separate both. A sensor of
-another kind, such as wheels and a compass, a camera or an INS, does: its errors grow with the distance travelled, and
-the receiver's do not. With its displacement d over an interval T, scaled by k and turned clockwise by h,
+A receiver's errors last for minutes and look like motion. A second sensor, such as wheels and a compass, a
+camera or an INS, separates both: its errors grow with the distance travelled. With its displacement d over an
+interval T, scaled by k and turned clockwise by h,
 
     p' = p + k A(h) d + w                  position,                       w ~ N(0, q^2 l I)
     v' = (k A(h) d + w) / T                velocity, the mean of T
     e' = exp(-T / tau) e + u               error of the positions,         u ~ N(0, s^2 (1 - exp(-2 T / tau)) I)
     z  = p + e + n                         what was measured,              n ~ N(0, R)
 
-The error e is a Gauss-Markov process of deviation s and correlation time tau (Brown and Hwang, Introduction to Random
-Signals and Applied Kalman Filtering, 1997, section 5.5), estimated with the position, so that what remains to be
-filtered is white (the same, section 8.7). The error of dead reckoning is a random walk of intensity q over the way l,
-the length of the displacement, and a little more: a still vehicle creeps no faster than ``CREEP``.
-Without a reading of the second sensor the velocity goes on with a white acceleration a, constant in the interval:
+The error e is a Gauss-Markov process of deviation s and correlation time tau (Brown and Hwang, Introduction
+to Random Signals and Applied Kalman Filtering, 1997, section 5.5); it is estimated with the position (section
+8.7). The error of dead reckoning is a random walk of intensity q over the way l, the length of the
+displacement, and a little more: a still vehicle creeps no faster than ``CREEP``. Without a reading of the
+second sensor the velocity goes on with a white acceleration a, constant in the interval:
 
     p' = p + T v + T^2 / 2 a,              v' = v + T a
 
-The states are position x, y, velocity x, y, error x, y; k, h, s, tau and q are constants of the filter. Nothing
-observes a constant error, one that lasts longer than the recording.
+The states are position x, y, velocity x, y, error x, y; k, h, s, tau and q are constants of the filter. A
+constant error is not observable.
 
 Shapes: batch last.
 """
@@ -33,7 +33,7 @@ CREEP = 0.01
 
 
 class Noise(NamedTuple):
-    """Noise parameters of the filter."""
+    """Noise parameters of the filter with dead reckoning."""
 
     drift: float | Array
     """q, error of dead reckoning, m over the root of the distance in m."""
@@ -54,7 +54,8 @@ def _both_axes(block: list[list[Array]]) -> Array:
 
 
 def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Array, Array]:
-    """Return mean ``(6, N)`` and covariance of the state at a first measured position, ``p = z - e - n``.
+    """Return mean ``(6, N)`` and covariance of the state at a first measured position, where
+    ``p = z - e - n``.
 
     Args:
         mean: position and velocity, the position as it was measured, ``(4, N)``, m and m/s.

@@ -41,7 +41,9 @@ class Series(NamedTuple):
 
 
 def choose_series(A: numpy.ndarray, longest: float) -> Series:
-    """Return the series that is exact to rounding for intervals up to ``longest``, s; for integrators it ends."""
+    """Choose the terms and doublings of :func:`discretise`, exact to rounding for intervals up to ``longest``,
+    s.
+    """
     power = numpy.eye(len(A))
     for k in range(1, len(A) + 1):
         power = power @ A
@@ -52,7 +54,8 @@ def choose_series(A: numpy.ndarray, longest: float) -> Series:
 
 
 def discretise(A: numpy.ndarray, D: numpy.ndarray, interval: Any, series: Series) -> tuple[Array, Array]:
-    """Return the transition matrix minus the identity, and the process noise, over an interval, ``(n, n)`` each.
+    """Return the transition matrix minus the identity, and the process noise covariance, both over an
+    interval.
 
     Args:
         A: matrix of the continuous model, ``(n, n)``, 1/s.
@@ -94,7 +97,7 @@ def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps:
 
 
 def constant_matrix_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
-    """Return the process noise over an interval for a matrix A that is constant in it, ``(n, n)``, by quadrature."""
+    """Return the process noise covariance ``(n, n)`` over an interval for a constant matrix A, by quadrature."""
     square = A @ A
     cube, total = square @ A, 0.0
     for point, weight in GAUSS_LEGENDRE:

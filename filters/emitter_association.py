@@ -17,10 +17,9 @@ and the table T(j, r, v) of the likelihood of all looks, which starts with the p
     T(j, 1, v) <- (1 - f) T(j, 1, v) + g T(j, 0, v),   T(j, 0, v) <- f T(j, 1, v) + (1 - g) T(j, 0, v)          (3)
     T(j, r, v) <- l(j, r, v) T(j, r, v)                                                                         (4)
 
-the forward recursion of a hidden Markov model (L. R. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 77 (1989),
-257-286, section III.A), exact on the grid. The mixture (1) is that of probabilistic data association (Bar-Shalom, Li
-and Kirubarajan, 2001, section 1.5) for one candidate of two sources. Silence alone does not inform about the class;
-through r it determines how probable the second emitter is when something is heard.
+the forward recursion of a hidden Markov model (L. R. Rabiner, A tutorial on hidden Markov models, Proc. IEEE
+77 (1989), 257-286, section III.A), exact on the grid. The mixture (1) is that of probabilistic data
+association (Bar-Shalom, Li and Kirubarajan, 2001, section 1.5) for one candidate of two sources.
 
 Where types are drawn anew for every decision, pi(rho | class) takes the place of pi(rho | type): a label j is anything
 that is constant and has decision probabilities.
@@ -43,7 +42,9 @@ FARTHEST = 300.0
 
 
 class Surroundings(NamedTuple):
-    """Grid of V points over the unknown second emitter and the target's silences, ``(V, 1)`` each."""
+    """Grid of V points over the unknown second emitter and the target's silences; its probabilities are
+    ``(V, 1)``.
+    """
 
     other_type: Array
     """Index i of the second emitter's type, an integer, ``(V,)``."""
@@ -65,7 +66,7 @@ def surroundings(
     sides: int,
     rates: Sequence[tuple[float, float, float, float]],
 ) -> Surroundings:
-    """Return a grid over type and bearing of the second emitter and rates of silence, of NumPy arrays.
+    """Make the grid over type and bearing of the second emitter and rates of silence, of NumPy arrays.
 
     Args:
         types: number of types that a second emitter may have.
@@ -93,7 +94,8 @@ def surroundings(
 
 
 def start_table(grid: Surroundings, labels: int) -> Array:
-    """Return the table of likelihoods before the first look, ``(J, 2, V, 1)``, with stationary silences.
+    """Return the table of likelihoods before the first look, ``(J, 2, V, 1)``, with silence in its stationary
+    state.
 
     Args:
         grid: grid of NumPy arrays.
@@ -104,7 +106,7 @@ def start_table(grid: Surroundings, labels: int) -> Array:
 
 
 def predict_silence(table: Array, grid: Surroundings, is_looking: Array) -> Array:
-    """Return the table of likelihoods after a possible start or end of silence before a look, equation (3).
+    """Return the table of likelihoods ``(J, 2, V, N)`` after silence may have started or ended, equation (3).
 
     Args:
         table: table of likelihoods, ``(J, 2, V, N)``.
@@ -119,7 +121,7 @@ def predict_silence(table: Array, grid: Surroundings, is_looking: Array) -> Arra
 
 
 class Look(NamedTuple):
-    """Report of the station at one scan."""
+    """Report of the ESM station at one scan."""
 
     looked: Array
     """Mask of episodes in which the station looks, ``(N,)`` booleans."""
@@ -134,7 +136,7 @@ def look_likelihood(
 ) -> Array:
     """Return the likelihood (1), (2) of a look for each label, silence and grid point, ``(J, 2, V, N)``.
 
-    It is relative to the density of a bearing at its mean, and one without a look.
+    Relative to the density of a bearing at its mean; one without a look.
 
     Args:
         grid: grid of V points.

@@ -7,25 +7,23 @@ observation j with variance r_j:
     x += g nu' / sqrt(s),  P -= g g^T
 
 This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``,
-``x = x' + P H^T R^-1 nu``, for a diagonal R. It inverts nothing, keeps P exactly symmetric, uses the zeros of
-h, leaves out unavailable observations, and its terms nu'^2 / s are independent contributions to the normalised
-innovation squared, in the order in which the observations are taken. For 17 states and 14 observations it
-takes as long as one stacked product of 31 x 31 matrices.
+``x = x' + P H^T R^-1 nu``, for a diagonal R. It keeps P exactly symmetric, and its terms nu'^2 / s are
+independent contributions to the normalised innovation squared.
 
 Reading: steps 5 and 6 of the paper write the Jacobian once through the picked parameters v = c x and once
 directly; one Jacobian with respect to the state is used.
 
-Robust update. Where the noise is Gaussian but for outliers, Huber's M-estimate minimises, for each observation
-in its turn, ``(x - x')^T P^-1 (x - x') / 2 + rho(u)`` with the residual after the update ``u = (nu' - h (x - x')) /
-sqrt(r)``, ``rho(u) = u^2 / 2`` up to a threshold k and ``k |u| - k^2 / 2`` beyond it. Reweighting, ``r' = r |u| / k``
-beyond the threshold, is the usual way to it. With one scalar observation its fixed point is a closed form,
+Robust update. Where the noise is Gaussian but for outliers, Huber's M-estimate minimises, for each
+observation in its turn, ``(x - x')^T P^-1 (x - x') / 2 + rho(u)`` with the residual after the update
+``u = (nu' - h (x - x')) / sqrt(r)``, ``rho(u) = u^2 / 2`` up to a threshold k and ``k |u| - k^2 / 2`` beyond
+it. Reweighting, ``r' = r |u| / k`` beyond the threshold, is the usual way to it. For one scalar observation
+its fixed point is
 
     s' = h P h^T + r' = max(s, sqrt(r) |nu'| / k),
 
-and s' takes the place of s. The prediction has its usual weight: an innovation that h P h^T explains is no
-outlier. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35,
-1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D. Kovacevic, Robust estimation with
-unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
+and s' takes the place of s. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of
+Mathematical Statistics 35, 1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D.
+Kovacevic, Robust estimation with unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
 
 Gain of another variance. With a caution c the gain is ``k = P h^T / (h P h^T + c r)``, of the noise c r in place of r;
 the covariance that it leaves is that of Joseph's form, ``P -= k u^T + u k^T`` with ``u = P h^T - s k / 2``.
@@ -50,7 +48,7 @@ class JacobianRow(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """Result of a measurement update by scalar observations."""
+    """Updated mean and covariance, log-likelihood and squared residuals of scalar observations."""
 
     mean: Array
     """Updated mean, ``(n, ...)``."""
@@ -74,7 +72,7 @@ def update_one_by_one(
     thresholds: Sequence[Array | float] | None = None,
     cautions: Sequence[Array | float] | None = None,
 ) -> Correction:
-    """Return mean, covariance and log-likelihood after m independent scalar observations.
+    """Update an extended Kalman filter with m independent scalar observations, one after the other.
 
     Args:
         mean: predicted mean, ``(n, ...)``.
@@ -82,12 +80,12 @@ def update_one_by_one(
         residual: observations minus their predictions at the predicted mean, ``(m, ...)``.
         rows: rows of the Jacobian at the predicted mean.
         variance: variances of the noise, m values that broadcast against ``(...)``.
-        available: one for an available observation, zero for others; m values that broadcast.
-        thresholds: k of each observation in the robust update, m values; infinity for none. None: the plain update.
-        cautions: factor on the variance of each observation in its gain alone, m values. None: the Kalman gain.
-
-    Returns:
-        The update; an observation that is not available changes nothing and has no likelihood.
+        available: one for an available observation; zero for others, which change nothing and have no
+            likelihood; m values.
+        thresholds: k of each observation in the robust update, m values; infinity for none. None: the plain
+            update.
+        cautions: factor on the variance of each observation in its gain alone, m values. None: the Kalman
+            gain.
     """
     xp = namespace(mean)
     shift: Array | float = 0.0

@@ -7,7 +7,7 @@ with latitude B, longitude L and ellipsoidal height h; a and f are the defining 
 (NIMA TR8350.2, 2000). A vector d of the Earth-fixed frame has east, north and up components
 ``E d`` with the rotation E of :func:`east_north_up`.
 
-Plain NumPy on angles in radians: sites are constants of an experiment, and recorded positions are read once.
+Plain NumPy, angles in radians.
 """
 
 from typing import NamedTuple

@@ -26,8 +26,7 @@ with C = R_1(roll) R_2(pitch) R_3(heading) N, N: ENU -> NED, and phi_INS, the an
 
 Reading: the paper names these observations and gives no formulas. Angles alone do not show their own error,
 so phi_INS enters through C, and y_eps is the difference between the INS and an independent attitude
-reference: without it the heading error would not be observable at rest. Attitude errors are small angles;
-their differences need no wrapping.
+reference: without it the heading error would not be observable at rest.
 
 Reading: the motion models of the hypotheses are not given. Rest: X stays, V and A are reset to zero.
 Constant velocity: ``X += T V``, A reset to zero, a velocity increment with input [T/2, 1]^T. Manoeuvre:
@@ -67,7 +66,8 @@ class AxisModel(NamedTuple):
 
 
 def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Return the axis model of hypothesis 1, rest: the position is constant, velocity and acceleration are zero.
+    """Return the axis model of a user at rest: position constant, velocity and acceleration zero (hypothesis
+    1).
 
     Args:
         T: step, s.
@@ -79,7 +79,7 @@ def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> Ax
 
 
 def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Return the axis model of hypothesis 2: constant velocity with random increments, zero acceleration.
+    """Return the axis model of constant velocity with random increments and no acceleration (hypothesis 2).
 
     Args:
         T: step, s.
@@ -92,7 +92,7 @@ def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma
 
 
 def singer_model(T: float, alpha: float, sigma: float) -> AxisModel:
-    """Return the axis model of hypothesis 3, Singer's manoeuvre; arguments as in :mod:`.singer`."""
+    """Return the axis model of Singer's manoeuvre (hypothesis 3); arguments as in :mod:`.singer`."""
     return AxisModel(singer.transition(alpha, T), singer.process_noise(alpha, sigma, T))
 
 
@@ -119,11 +119,10 @@ def common_model(
     rate_sigma: float,
     rate_time: float,
 ) -> CommonModel:
-    """Return the discrete model of the clock and of the attitude errors.
+    """Return the discrete model of clock and attitude errors over one step.
 
     The clock is the usual two-state model (Brown and Hwang, Introduction to Random Signals and Applied Kalman
-    Filtering, 2012, section 9.3): ``q_DD = S_f T + S_g T^3 / 3``, ``q_DV = S_g T^2 / 2``, ``q_VV = S_g T``;
-    the covariance of bias and drift is included.
+    Filtering, 2012, section 9.3): ``q_DD = S_f T + S_g T^3 / 3``, ``q_DV = S_g T^2 / 2``, ``q_VV = S_g T``.
 
     Args:
         T: step, s.
@@ -150,7 +149,7 @@ def common_model(
 
 
 def process_noise(axis: AxisModel, common: CommonModel) -> Array:
-    """Return the covariance of the process noise of one hypothesis, ``(17, 17)``."""
+    """Assemble the covariance of the process noise of one motion hypothesis, ``(17, 17)``."""
     Q = zeros_for((SIZE, SIZE), axis.noise, *common)
     x, v, a = (list(range(SIZE))[part] for part in (POSITION, VELOCITY, ACCELERATION))
     for i in range(3):
@@ -164,7 +163,8 @@ def process_noise(axis: AxisModel, common: CommonModel) -> Array:
 
 
 def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
-    """Return the product of the transition matrix with a vector or matrix, ``F x`` or ``F P``, without its zeros.
+    """Multiply a vector or matrix by the transition matrix, ``F x`` or ``F P``, without the products with
+    zeros.
 
     Args:
         state: x or P, ``(17, ...)``.
@@ -262,8 +262,6 @@ def range_jacobian(satellites: Geometry) -> list[JacobianRow]:
 def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
     """Return the rotation from east-north-up to body axes (forward, right, down), as three rows of three arrays.
 
-    ``C = R_1(roll) R_2(pitch) R_3(heading) N``.
-
     Args:
         angles: heading, pitch, roll, ``(3, ...)``, rad.
     """
@@ -281,8 +279,7 @@ def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
 def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Array, list[JacobianRow]]:
     """Return the predicted accelerometer readings, ``(3, ...)``, m/s^2, and their Jacobian rows.
 
-    The derivatives of C by its own angles are combinations of the readings themselves, for example
-    ``df/droll = [0, f_down, -f_right]``.
+    Derivatives by angles are combinations of the readings, for example ``df/droll = [0, f_down, -f_right]``.
 
     Args:
         state: state of the user, ``(17, ...)``.
@@ -313,7 +310,7 @@ def attitude_jacobian() -> list[JacobianRow]:
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Return the predicted observations of a state, ``(2 S + 6, ...)``, and their Jacobian rows.
+    """Return the predicted observations ``(2 S + 6, ...)`` of a state, and their Jacobian rows.
 
     In this order: S pseudoranges, S pseudorange rates, three accelerometers, three attitude errors.
 
@@ -332,7 +329,7 @@ def observe(
 
 
 def sensor_groups(satellites: int) -> Sequence[slice]:
-    """Return the slices of pseudoranges, rates, accelerometers and attitude errors in the observations."""
+    """Return the slices of the sensors' kinds in the result of :func:`observe`."""
     return (
         slice(0, satellites),
         slice(satellites, 2 * satellites),

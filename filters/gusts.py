@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 
 class FormingFilter(NamedTuple):
-    """Filter that shapes white noise to the gust angle."""
+    """Bandwidth and intensities of a first-order filter that shapes white noise to the gust angle."""
 
     rate: float
     """Bandwidth V / L, 1/s."""

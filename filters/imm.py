@@ -30,7 +30,7 @@ class ModePrediction(NamedTuple):
 
 
 def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModePrediction:
-    """Return the predicted mode probabilities (13) and mixing weights (10) of a Markov chain.
+    """Return predicted mode probabilities (13) and mixing weights (10) from the mode probabilities before.
 
     A mode that cannot be reached (predicted probability zero) keeps its own estimate.
 
@@ -85,7 +85,7 @@ def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Arra
 
 
 def log_probabilities(probabilities: Array) -> Array:
-    """Return the logarithms of probabilities, at least log 1e-300 instead of minus infinity."""
+    """Return the natural logarithms of probabilities, limited below to log 1e-300."""
     xp = namespace(probabilities)
     if probabilities.dtype == xp.float64:
         return xp.log(xp.clip(probabilities, 1e-300, None))

@@ -2,10 +2,10 @@ r"""Kalman update with a given innovation and gain, for extended, unscented and 
 
     S = H P H^T + R,  K = P H^T S^-1,  x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T       (Joseph form)
 
-with the innovation ``nu = z - h(x')`` and the Jacobian H of h at x'; Bar-Shalom, Li and Kirubarajan, Estimation with
-Applications to Tracking and Navigation (2001), sections 5.2 and 10.3. Joseph's form holds for every gain. Entries
-that were not received take no part: their rows of H and of the innovation become zero, and their noise is of variance
-one and independent of all others.
+with the innovation ``nu = z - h(x')`` and the Jacobian H of h at x'; Bar-Shalom, Li and Kirubarajan,
+Estimation with Applications to Tracking and Navigation (2001), sections 5.2 and 10.3. Entries that were not
+received take no part: their rows of H and of the innovation are zero, their noise is independent and of
+variance one.
 
 Arrays have the batch last; a matrix shared by the whole batch is ``(n, n)``.
 """
@@ -37,7 +37,8 @@ class Received(NamedTuple):
 
 
 def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Received:
-    """Return the measurement model without the entries that were not received: zero innovation and H, unit noise.
+    """Restrict a measurement model to the received entries: the others get zero innovation and H, and unit
+    noise.
 
     Args:
         innovation: innovation, ``(m, N)``, finite.
@@ -46,10 +47,10 @@ def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Re
         available: 1 for entries received, 0 for others, ``(m, N)``.
     """
     H, R = (part[..., None] if part.ndim == 2 else part for part in (H, R))
-    return Received(available * innovation, available[:, None] * H, _independent(R, available), available)
+    return Received(available * innovation, available[:, None] * H, _isolate_missing(R, available), available)
 
 
-def _independent(S: Array, available: Array) -> Array:
+def _isolate_missing(S: Array, available: Array) -> Array:
     """Return a covariance ``(m, m, N)`` with rows and columns of the identity for entries not received."""
     xp = namespace(available)
     m = available.shape[0]
@@ -64,16 +65,14 @@ def kalman_gain(covariance: Array, received: Received) -> Array:
 
 
 def update_with_gain(mean: Array, covariance: Array, received: Received, K: Array) -> Update:
-    """Return the measurement update with any gain (Joseph form).
+    """Return the measurement update with any gain (Joseph form), and the log-likelihood of the received
+    entries.
 
     Args:
         mean: predicted mean, ``(n, N)``.
         covariance: predicted covariance, ``(n, n, N)``.
         received: innovation with its model.
         K: gain, ``(n, m, N)``.
-
-    Returns:
-        The update, with the log-likelihood of the received entries.
     """
     xp = namespace(mean)
     nu, H, R, available = received
@@ -82,11 +81,13 @@ def update_with_gain(mean: Array, covariance: Array, received: Received, K: Arra
     joseph = product(product(rest, covariance), transpose(rest)) + product(product(K, R), transpose(K))
     joseph = 0.5 * (joseph + transpose(joseph))
     density, nis = log_density(nu, product(product(H, covariance), transpose(H)) + R)
-    return Update(mean + apply(K, nu), joseph, density + _of_missing(available), nis)
+    return Update(mean + apply(K, nu), joseph, density + _density_of_missing(available), nis)
 
 
-def _of_missing(available: Array) -> Array:
-    """Return the correction of a log-density that removes the entries that were not received, ``(N,)``."""
+def _density_of_missing(available: Array) -> Array:
+    """Return the term ``m_missing log(2 pi) / 2`` by which a log-density exceeds that of m received entries,
+    ``(N,)``.
+    """
     return 0.5 * math.log(2.0 * math.pi) * ordered_sum(1.0 - available)
 
 
@@ -123,17 +124,17 @@ def unscented_update(
     R = R[..., None] if R.ndim == 2 else R
     joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
     nu = available * subtract(z, joint[n:])
-    S = _independent(spread_out[n:, n:] + R, available)
+    S = _isolate_missing(spread_out[n:, n:] + R, available)
     cross = available[:, None] * spread_out[n:, :n]
     gated, taken = S, nu
     if within_gates is not None:
         kept = within_gates(nu, S)
-        gated, taken, cross = _independent(S, kept), kept * nu, kept[:, None] * cross
+        gated, taken, cross = _isolate_missing(S, kept), kept * nu, kept[:, None] * cross
     K = transpose(solve_definite(gated, cross))
     density, nis = log_density(nu, S)
     return Update(
         mean + apply(K, taken),
         mirror_lower(covariance - product(K, cross)),
-        density + _of_missing(available),
+        density + _density_of_missing(available),
         nis,
     )

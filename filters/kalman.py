@@ -16,7 +16,7 @@ from .small_matrices import apply, product, solve_definite, transpose
 
 
 class Update(NamedTuple):
-    """Result of a measurement update."""
+    """Result of a measurement update: mean, covariance, log-likelihood and NIS."""
 
     mean: Array
     """Updated mean, ``(n, N)``."""
@@ -29,7 +29,6 @@ class Update(NamedTuple):
 
 
 def _with_batch_axis(matrix: Array) -> Array:
-    """Return a matrix that is shared by the batch with a last axis of one."""
     return matrix[..., None] if matrix.ndim == 2 else matrix
 
 

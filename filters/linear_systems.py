@@ -14,7 +14,7 @@ Reading: the paper's ``+I Q`` in the first line of (12) is ``+ R``; with samplin
 Reading: the correcting term of (5) bounds P only when the model is detectable *and* noise reaches every
 integrating or unstable mode; :func:`steady_kalman` refuses the rest, with the mode that is to blame.
 
-One model at a time, plain NumPy and SciPy: this is work done once, before a filter runs.
+One model at a time, in plain NumPy and SciPy.
 """
 
 import math
@@ -86,9 +86,8 @@ def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matr
     """Return transition matrix F and process noise covariance Q of a continuous model over an interval.
 
     ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of
-    ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. Its upper left block
-    grows without limit where modes decay, so a long interval is halved until ``|A| T`` is at most one, then
-    doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
+    ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. A long interval is
+    halved until ``|A| T`` is at most one, then doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
 
     Args:
         A: matrix of the continuous model, ``(n, n)``, 1/s.
@@ -175,7 +174,7 @@ def _list(modes: list[complex]) -> str:
 
 
 class SteadyFilter(NamedTuple):
-    """Steady-state Kalman filter."""
+    """Steady-state Kalman filter: gain, covariances and poles."""
 
     gain: Matrix
     """Kalman gain K, ``(n, m)``."""
@@ -188,7 +187,7 @@ class SteadyFilter(NamedTuple):
 
 
 def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) -> None:
-    """Raise ValueError with the reason if the Riccati equation of the filter has no stabilising solution."""
+    """Raise ValueError, with the reason, if the filter's Riccati equation has no stabilising solution."""
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the measurement noise must be positive definite, got R = {R.tolist()}")
     hidden = unobservable_modes(F, H, continuous)
@@ -252,7 +251,7 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
 def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: ArrayLike) -> SteadyFilter:
     """Return the steady-state continuous Kalman filter (4), (5), from the algebraic Riccati equation.
 
-    A random constant in the state violates its conditions: the variance falls for ever, like 1/t.
+    A random constant in the state has no steady state: its variance falls like 1/t.
 
     Args:
         A: matrix of the model, ``(n, n)``, 1/s.
@@ -292,7 +291,7 @@ def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
 
 
 class Regulator(NamedTuple):
-    """Linear-quadratic regulator of a plant whose state is known."""
+    """Gain of a linear-quadratic regulator, and the cost of deviations from its control."""
 
     feedback: Matrix
     """Gain L of ``u = -L x``, ``(r, n)``."""
@@ -372,8 +371,7 @@ def estimate_feedback_loop(
     """Return the loop closed over a filter, ``u = -L x(k|k)``, in state and error ``e = x - x(k|k)``.
 
     ``[x; e](k+1) = [[F - B L, B L], [0, (I - K H) F]] [x; e](k) + [[I, 0], [I - K H, -K]] [w; v]``. The zero
-    block is the separation principle: the poles are those of ``F - B L`` and those of ``(I - K H) F``,
-    whatever the gain K.
+    block is the separation principle: the poles are those of ``F - B L`` and those of ``(I - K H) F``.
 
     Args:
         F: transition matrix, ``(n, n)``.
@@ -402,10 +400,11 @@ def measurement_feedback_loop(F: Matrix, B: Matrix, H: Matrix, L: Matrix, Q: Mat
 
 
 def separation_defect(F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix) -> float:
-    """Return the largest distance between poles of the loop with filter and those of the separated designs.
+    """Return the largest distance between closed-loop poles and those of the separate regulator and filter
+    designs.
 
-    The loop is written in state and *estimate*, where separation is not visible, and its poles are matched
-    one to one with the union of ``eig(F - B L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.
+    The loop is written in state and *estimate*; its poles are matched one to one with those of
+    ``eig(F - B L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.
     """
     from scipy.optimize import linear_sum_assignment
 

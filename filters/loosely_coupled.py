@@ -1,8 +1,9 @@
 r"""Loosely coupled INS and GNSS on one axis: INS error model, plain scheme, augmented error state.
 
-    INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w GNSS     Z      = Xr +
-    zeta plain    dXh/dt = dX/dt + K (Z - Xh),           K = sqrt(Ge / N) when settled error    d delta/dt = beta + eta
-    + xi,          delta = X - Xr,  X - Z = delta - zeta
+    INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w
+    GNSS     Z      = Xr + zeta
+    plain    dXh/dt = dX/dt + K (Z - Xh),           K = sqrt(Ge / N) when settled
+    error    d delta/dt = beta + eta + xi,          delta = X - Xr,  X - Z = delta - zeta
 
 ``xi`` has the intensity G, ``zeta`` N, ``eta`` the stationary variance ``sigma^2``, ``beta`` the variance
 ``sigma_b^2``. This is Fig. 3 of the paper by Benkafo and Lobaty; its (4) and (5) with A = 0 and the
@@ -13,9 +14,8 @@ as filtering ``X - Z`` with an error that walks at random.
 Reading: "the systematic errors are compensated" holds for the plain scheme as an attenuation, of a constant
 rate error to ``beta / K``; only the augmented scheme, which estimates (delta, beta, eta), removes it.
 
-The filters are written for the estimate ``Xh = X - delta_h`` of the position itself, with the innovation
-``nu = Z - Xh``. Everything is elementwise in the batch; axes of space are just more batch. One covariance
-serves all axes, for it depends on the noise levels and on the gaps in the data only.
+The filters compute ``Xh = X - delta_h`` of the position itself, with the innovation ``nu = Z - Xh``.
+Everything is elementwise in the batch; one covariance serves all axes of space.
 """
 
 import math
@@ -30,7 +30,7 @@ from .linear_systems import Matrix, van_loan
 def error_model(
     drift: float, coloured: float, correlation_time: float, white_intensity: float
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Return the continuous model of the INS error (delta, beta, eta): A, noise intensity, initial covariance.
+    """Return A, noise intensity and initial covariance of the continuous INS error model (delta, beta, eta).
 
     Args:
         drift: standard deviation of the constant rate error, m/s.
@@ -64,7 +64,7 @@ class Sampling(NamedTuple):
 
 
 def sampling(correlation_time: float, step: float) -> Sampling:
-    """Return the coefficients of the INS error sampled exactly, for a coloured rate error of unit variance."""
+    """Return the exact discrete coefficients of the INS error, for a coloured rate error of unit variance."""
     A, BGBt, _ = error_model(0.0, 1.0, correlation_time, 0.0)
     Phi, Qd = van_loan(A, BGBt, step)
     coupling = Qd[0, 2] / Qd[2, 2]
@@ -113,9 +113,7 @@ class PlainVariance(NamedTuple):
 def predict_plain(
     P: PlainVariance, s: Sampling, growth: float, drift: float, coloured: float, white_intensity: float
 ) -> PlainVariance:
-    """Return the variances of the plain scheme after one step without a measurement.
-
-    The variances of the rate errors do not change, since the plain scheme does not estimate them.
+    """Predict the variances of the plain scheme over one step.
 
     Args:
         P: variances after the previous measurement.
@@ -137,9 +135,8 @@ def predict_plain(
 
 
 def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
-    """Return the variances of the plain scheme after an update with any gain (Joseph form).
-
-    The gain must not depend on the innovations.
+    """Update the variances of the plain scheme with any gain that does not depend on innovations (Joseph
+    form).
 
     Args:
         P: predicted variances.
@@ -156,11 +153,10 @@ def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
 def best_constant_gain(
     drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
 ) -> float:
-    """Return the gain K, 1/s, with the least steady mean square error: a bound for any tuning of the plain scheme.
+    """Return the gain K, 1/s, with the least steady mean square error of the plain scheme.
 
     From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta`` the settled mean square error is
-    ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``, m^2; the first term is what is left
-    of the constant. It is convex in K, so one root of its derivative is the minimum.
+    ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``, m^2, convex in K.
 
     Args:
         drift: standard deviation of the constant rate error, m/s.
@@ -213,7 +209,7 @@ class AugmentedCovariance(NamedTuple):
 def predict_augmented(
     P: AugmentedCovariance, s: Sampling, coloured: Array, white: Array
 ) -> AugmentedCovariance:
-    """Return the covariance of (delta, beta, eta) after one step without a measurement, ``F P F^T + Qd``.
+    """Predict the covariance of (delta, beta, eta) over one step, ``F P F^T + Qd``.
 
     Args:
         P: covariance after the previous measurement.
@@ -250,8 +246,7 @@ def update_augmented(
 ) -> tuple[AugmentedFilterGain, AugmentedCovariance]:
     """Return the Kalman gains and the updated covariance of (delta, beta, eta) for a measurement of delta.
 
-    ``K = P H^T / S``, ``P - K S K^T``; with this gain, which is Kalman's, and one measurement the position
-    variance is ``P R / S``, positive whatever the rounding.
+    ``K = P H^T / S``, ``P - K S K^T``; the position variance ``P R / S`` is positive whatever the rounding.
 
     Args:
         P: predicted covariance.

@@ -8,9 +8,8 @@ Sage and Husa, "Adaptive filtering with unknown prior statistics", Joint Automat
     d_k = (1 - b) / (1 - b^(k+1))                                                                          (4)
 
 with the innovation ``nu = z - H x'``, the residual ``epsilon = z - H x``, P' and P the covariances before and
-after the update, b the forgetting factor. (2) is what the paper's estimate becomes when the filtered state
-stands in for the smoothed one; its samples have the mean R only where the filter's R is already right, so it
-converges by a fraction of the error, where (1) has no bias: it is not used here.
+after the update, b the forgetting factor. (2) is the paper's estimate with the filtered state in place of the
+smoothed one; unlike (1) it is biased unless the filter's R is right, and it is not used here.
 
 Mehra, "Approaches to adaptive filtering", IEEE Transactions on Automatic Control 17(5), 1972, covariance
 matching over the last W measurements (after "On the identification of variances and adaptive Kalman filtering",
@@ -72,7 +71,7 @@ def sage_husa(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> Level:
-    """Return the updated estimate of a measurement's noise variance by Sage and Husa, (1), limited from below.
+    """Return Sage and Husa's estimate (1) of a measurement's noise variance, limited from below.
 
     Args:
         level: variance before.
@@ -87,7 +86,8 @@ def sage_husa(
 
 
 def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:
-    """Return a sample of the factor on the process noise, ``(N,)``, from the diagonal of equation (3).
+    """Return a sample of the factor on the process noise, ``(N,)``, from the diagonal of (3), averaged over
+    coordinates.
 
     Its mean is the true factor if the filter uses the right one. Without a measurement it is the factor that the filter
     uses. Single samples are often negative: average them with :func:`fading_mean` and limit the average from below.
@@ -97,9 +97,6 @@ def process_noise_factor(correction: Array, updated: Array, carried: Array, unit
         updated: their variances after the update, ``(c, N)``.
         carried: their variances predicted without process noise, the diagonal of ``F P F^T``, ``(c, N)``.
         unit: their variances by the process noise of factor one, ``(c,)`` lists or ``(c, N)``, above zero.
-
-    Returns:
-        Mean over the coordinates, ``(N,)``.
     """
     c = len(unit)
     return ordered_sum((correction[i] ** 2 + updated[i] - carried[i]) / unit[i] for i in range(c)) / c
@@ -117,7 +114,8 @@ def mehra(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> tuple[Array, Array]:
-    """Return the updated estimate of a measurement's noise variance by Mehra, (5), limited from below, and the window.
+    """Return Mehra's estimate (5) of a measurement's noise variance, limited from below, and the updated
+    window.
 
     Args:
         window: the last samples, the oldest first, ``(W, ...)``.
@@ -125,9 +123,6 @@ def mehra(
         predicted: variance of the predicted measurement, ``H P' H^T``.
         least: lower limit of the variance.
         available: 1 with a measurement, 0 without.
-
-    Returns:
-        The variance, and the window with the new sample in place of the oldest.
     """
     xp = namespace(window)
     sample = innovation**2 - predicted
@@ -137,7 +132,7 @@ def mehra(
 
 
 class InverseGamma(NamedTuple):
-    """Inverse-gamma distribution of a variance."""
+    """Inverse-gamma distribution of a noise variance."""
 
     shape: Array
     """Shape alpha: half the effective number of measurements."""
@@ -151,7 +146,8 @@ class InverseGamma(NamedTuple):
 
 
 def forget(noise: InverseGamma, forgetting: float, available: Array | float = 1.0) -> InverseGamma:
-    """Return the distribution with the same variance from fewer measurements, equation (6).
+    """Return the noise distribution with the same variance and less weight, before a measurement, equation
+    (6).
 
     Args:
         noise: distribution after the previous measurement.

@@ -12,11 +12,11 @@ probabilities after the last measurement and v_i = c_i p_i, V = sum_i v_i,
 which is the mixing of the interacting multiple model (H. A. P. Blom and Y. Bar-Shalom, IEEE Trans. Automatic Control 33
 (1988), 780-783) with the transition matrix ``(1 - c_i) delta_ij + c_i pi_j``, in H steps in place of H^2.
 
-The standard deviation of a sensor's noise is one of L levels, a Markov chain of its own; within hypothesis j the
-probabilities of the levels of sensor k are q_kl. A reading is then taken in with the Gaussian sum of L variances,
-merged by its moments (:func:`.receiver_faults.weigh_levels`; D. L. Alspach and H. W. Sorenson, IEEE Trans. Automatic
-Control 17 (1972), 439-448). Sensors with independent noise are taken in one after the other, in the order given:
-a Gaussian-sum update is not linear, so the order has an influence, of the size of what merging loses.
+The standard deviation of a sensor's noise is one of L levels, a Markov chain of its own; within hypothesis j
+the probabilities of the levels of sensor k are q_kl. A reading is then taken in with the Gaussian sum of L
+variances, merged by its moments (:func:`.receiver_faults.weigh_levels`; D. L. Alspach and H. W. Sorenson,
+IEEE Trans. Automatic Control 17 (1972), 439-448). Sensors with independent noise are processed one after the
+other; their order has a small influence.
 
 Shapes: means ``(n, H, N)``, packed covariances ``(n (n + 1) / 2, H, N)``, probabilities ``(H, N)``, those of the levels
 of a sensor ``(L, H, N)``.
@@ -47,7 +47,7 @@ class LevelHypotheses(NamedTuple):
     """Probabilities of the levels of each sensor, ``(L, H, N)``."""
 
     def take(self, part: slice) -> "LevelHypotheses":
-        """Return a slice of the hypotheses."""
+        """Return the hypotheses of a slice."""
         return LevelHypotheses(
             self.mean[:, part],
             self.covariance[:, part],
@@ -56,8 +56,8 @@ class LevelHypotheses(NamedTuple):
         )
 
 
-def squares(deviation: Array) -> Array:
-    """Return the packed lower triangles of ``d d^T`` for vectors ``(n, ...)``."""
+def outer_products(deviation: Array) -> Array:
+    """Return the outer products ``d d^T`` of vectors ``(n, ...)`` as packed lower triangles."""
     xp = namespace(deviation)
     return xp.concat([deviation[j:] * deviation[j] for j in range(deviation.shape[0])], axis=0)
 
@@ -74,7 +74,7 @@ class Moments(NamedTuple):
 
 
 def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
-    """Return the moments (2) of the mixture of H hypotheses.
+    """Return mean and packed covariance of a mixture of H hypotheses, equation (2).
 
     Args:
         mean: means, ``(n, H, N)``.
@@ -85,14 +85,14 @@ def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
     shares = weights / total
     many = range(weights.shape[0])
     centre = ordered_sum(shares[i] * mean[:, i] for i in many)
-    spread = ordered_sum(shares[i] * (covariance[:, i] + squares(mean[:, i] - centre)) for i in many)
+    spread = ordered_sum(shares[i] * (covariance[:, i] + outer_products(mean[:, i] - centre)) for i in many)
     return Moments(centre, spread, total, shares)
 
 
 def switch(
     before: LevelHypotheses, change: Array, prior: Array, sensor_change: Array, levels: Array
 ) -> LevelHypotheses:
-    """Return the hypotheses after possible changes of level before a step, equations (1) to (4).
+    """Mix H hypotheses before a step, in which their levels may change, equations (1) to (4).
 
     Args:
         before: hypotheses after the last measurement.
@@ -117,7 +117,7 @@ def switch(
         sensors.append((1.0 - sensor_change) * mixed + sensor_change * levels)
     return LevelHypotheses(
         mean - other * deviation,
-        own * covariance + other * pool.covariance[:, None] + (own * other) * squares(deviation),
+        own * covariance + other * pool.covariance[:, None] + (own * other) * outer_products(deviation),
         after,
         tuple(sensors),
     )
@@ -137,7 +137,7 @@ class SensorUpdate(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """Distribution of the noise level of a sensor."""
+    """Levels of a sensor's noise, their probabilities, and the share and variance of outliers."""
 
     variances: Array
     """Variances of the levels, ascending, ``(L, H, 1)``."""
@@ -152,7 +152,7 @@ class SensorNoise(NamedTuple):
 def update_sensor(
     mean: Array, covariance: Array, z: Array, rows: Sequence[int], noise: SensorNoise, available: Array
 ) -> SensorUpdate:
-    """Return the update with the reading of a sensor whose noise has one of several levels.
+    """Update all hypotheses with the reading of one sensor, whose noise has one of several levels.
 
     Args:
         mean: predicted means, ``(n, H, N)``.

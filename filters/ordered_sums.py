@@ -1,8 +1,8 @@
 """Sums in a fixed order, whose rounding does not depend on the width of the batch.
 
-The reductions of NumPy and torch choose the order of their additions by the shape of the array, so that lane i
-of a wide batch would differ in the last bit from the same episode alone. Here the terms are added one after
-the other. The inner products of matrices do the same in :mod:`~filtergym.filters.small_matrices`.
+The reductions of NumPy and torch choose the order of their additions by the shape of the array, so that lane
+i of a wide batch would differ in the last bit from the same episode alone. Here the terms are added one after
+the other.
 """
 
 import functools

@@ -1,8 +1,8 @@
 r"""Kalman filter on covariances stored as lower triangles (packed), with sensors of single coordinates.
 
-A symmetric ``(n, n, N)`` is stored as ``(n (n + 1) / 2, N)``: the columns of its lower triangle one after
-the other, ``P00, P10, P20, ..., P11, P21, ...``. It is symmetric by construction, takes almost half the
-arithmetic, and its prediction is one matrix product over the whole batch: ``F P F^T`` is linear in P.
+A symmetric ``(n, n, N)`` is stored as ``(n (n + 1) / 2, N)``: the columns of its lower triangle one after the
+other, ``P00, P10, P20, ..., P11, P21, ...``. It takes almost half the arithmetic, and its prediction is one
+matrix product over the whole batch: ``F P F^T`` is linear in P.
 
 Measurements of single coordinates with independent noise are taken in one after the other,
 
@@ -68,7 +68,7 @@ def propagator(F: numpy.ndarray) -> numpy.ndarray:
 
 
 class PackedUpdate(NamedTuple):
-    """Result of an update with measurements of single coordinates."""
+    """Updated mean and packed covariance, log-likelihood and NIS of measurements of coordinates."""
 
     mean: Array
     """Updated mean, ``(n, N)``."""
@@ -88,7 +88,8 @@ def update_coordinates(
     R: Array,
     available: Array,
 ) -> PackedUpdate:
-    """Return the update with independent measurements of single coordinates, or of sums of some.
+    """Update mean and packed covariance with independent measurements of coordinates, or of sums of
+    coordinates.
 
     Args:
         mean: predicted mean, ``(n, N)``.
@@ -128,7 +129,7 @@ class GainModel(NamedTuple):
 
 
 class UpdateWithGain(NamedTuple):
-    """Result of an update of single coordinates with the gain of another covariance."""
+    """Result of an update of single coordinates with the gain of another covariance, which is updated, too."""
 
     mean: Array
     """Updated mean, ``(n, N)``."""
@@ -147,9 +148,9 @@ def update_coordinates_with_gain(
     available: Array,
     gain_model: GainModel,
 ) -> UpdateWithGain:
-    """Return the update with measurements of single coordinates and the gain of another covariance M.
+    """Update mean and packed covariance with single coordinates, by the Kalman gain of another covariance M.
 
-    One after the other, with the column m of M and the column p of P that belong to the coordinate i::
+    One coordinate i after the other, with the columns m of M and p of P::
 
         k = m / (m_i + R'),  x = x + k (z - x_i),  P = P - k u^T - u k^T,  u = p - k (p_i + R) / 2,  M = M - k m^T
 

@@ -16,8 +16,8 @@ Both predictions differ in e_j alone. They are merged with these weights before 
 
     (1 - pi) P_jj + pi v + pi (1 - pi) (e_j - m)^2.                                                            (3)
 
-Reading: the moments of the mixture of both *updates* would take two updates of the whole covariance; where pi is zero
-or one, which one innovation of a few standard deviations makes it, both are the same.
+Reading: merging after both *updates* would take two updates of the whole covariance; for pi of zero or one
+the result is the same.
 
 :func:`take_reading` is the update by one scalar observation whose noise is a Gaussian sum over L variances, with the
 score and its derivative of :func:`.receiver_faults.weigh_levels` (Masreliez 1975): ``x += P h^T g nu``,
@@ -44,7 +44,7 @@ LARGEST_PROBABILITY = 1.0 - 1e-12
 
 
 def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> tuple[Array, Array]:
-    """Return mean and covariance augmented by the range errors, which have mean zero and a variance.
+    """Append range errors of mean zero to the mean and covariance of the first 17 states.
 
     Args:
         mean: mean of the first 17 states, ``(17, N)``.
@@ -62,7 +62,7 @@ def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> t
 
 
 def advance(state: Array, axis: Array, T: float, decay: float, persistence: Array | list[Array]) -> Array:
-    """Return the product of the transition matrix with a vector or matrix, ``F x`` or ``F P``.
+    """Multiply a vector or matrix of states with range errors by the transition matrix, ``F x`` or ``F P``.
 
     Args:
         state: x or P, ``(17 + S, ...)``.
@@ -113,7 +113,7 @@ def predict(
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Return the predicted observations of a state, with range errors in the pseudoranges, and their Jacobian rows.
+    """Return the predicted observations of a state with range errors, and their Jacobian rows.
 
     Arguments as of :func:`.gnss_ins.observe`.
     """
@@ -127,7 +127,7 @@ def observe(
 
 
 class SequentialUpdate(NamedTuple):
-    """State during an update by one scalar observation after the other."""
+    """Intermediate state of an update by one scalar observation after the other."""
 
     shift: Array
     """Mean minus predicted mean, ``(n, ...)``."""
@@ -140,15 +140,14 @@ class SequentialUpdate(NamedTuple):
 
 
 def begin(mean: Array, covariance: Array) -> SequentialUpdate:
-    """Return the state of a sequential update before its first observation."""
+    """Return the state of a sequential update before its first observation: no shift, zero log-likelihood."""
     none = 0.0 * mean[0]
     return SequentialUpdate(0.0 * mean, covariance, none, none)
 
 
 def innovation_of(state: SequentialUpdate, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
-    """Return the innovation of an observation given those before, its covariance ``P h^T``, and ``h P h^T``.
-
-    The covariance is that with the state, ``(n, ...)``.
+    """Return the innovation of an observation given those before, ``P h^T`` of shape ``(n, ...)``, and
+    ``h P h^T``.
 
     Args:
         state: state before the observation.
@@ -173,7 +172,7 @@ def take_reading(
     probabilities: Array,
     available: Array,
 ) -> tuple[SequentialUpdate, Array]:
-    """Return the state updated with a scalar observation whose noise is a Gaussian sum, and the levels' weights.
+    """Update with a scalar observation whose noise is a Gaussian sum; return also the noise levels' weights.
 
     Args:
         state: state before the observation.
@@ -221,7 +220,7 @@ def take_pseudorange(
     renewal: Renewal,
     available: Array,
 ) -> SequentialUpdate:
-    """Return the state updated with a pseudorange whose error may have been drawn anew, (2) and (3).
+    """Update with a pseudorange whose slowly varying error may have been drawn anew, (2) and (3).
 
     Args:
         state: state before the observation.
@@ -267,7 +266,7 @@ def take_pseudorange(
 
 
 def _replace(covariance: Array, place: int, values: Sequence[Array], own: Array) -> Array:
-    """Return the covariance with the row, column and variance of one state replaced."""
+    """Replace the row, column and variance of one state in a covariance."""
     xp = namespace(covariance)
     row = xp.concat([values[:place], own[None], values[place + 1 :]])
     covariance = xp.concat([covariance[:place], row[None], covariance[place + 1 :]])

@@ -18,8 +18,6 @@ A filter of one Gaussian then updates by the score of the density of its innovat
 
 the exact mean and covariance of the mixture of L Kalman updates, whose gains all lie along ``P H^T``.
 
-Sources of these:
-
 * Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans. AC 17(4), 1972.
 * Masreliez, "Approximate non-Gaussian filtering with linear state and observation relations", IEEE Trans. AC 20(1),
   1975.
@@ -48,7 +46,7 @@ class FaultCovariance(NamedTuple):
 def predict_fault(
     P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, noise_variance: Array
 ) -> FaultCovariance:
-    """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
+    """Predict the covariance of INS and receiver errors over one step, ``F P F^T + Qd``.
 
     Args:
         P: covariance after the previous measurement.
@@ -73,7 +71,7 @@ def predict_fault(
 
 
 def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
-    """Return the covariance with one more error of the receiver, independent of all others.
+    """Append one more receiver error, independent of all others, to the covariance.
 
     Args:
         P: covariance without it.
@@ -90,7 +88,9 @@ def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
 
 
 def matrix(P: FaultCovariance) -> Array:
-    """Return the covariance of (delta, beta, eta, e) as one array, ``(3 + E, 3 + E, ...)``."""
+    """Return the covariance of INS and receiver errors (delta, beta, eta, e) as one array,
+    ``(3 + E, 3 + E, ...)``.
+    """
     xp, ins = namespace(P.faults), P.ins
     first = [
         [ins.position, ins.position_drift, ins.position_coloured],
@@ -102,7 +102,7 @@ def matrix(P: FaultCovariance) -> Array:
 
 
 def from_matrix(P: Array) -> FaultCovariance:
-    """Return the covariance in parts from one array ``(3 + E, 3 + E, ...)``."""
+    """Split a covariance ``(3 + E, 3 + E, ...)`` into the parts of a :class:`FaultCovariance`."""
     ins = (P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
     return FaultCovariance(AugmentedCovariance(*ins), P[:3, 3:], P[3:, 3:])
 
@@ -143,7 +143,7 @@ def measured_direction(P: FaultCovariance, h: Array) -> Direction:
 
 
 def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCovariance:
-    """Return the covariance after an update, ``P - P H^T weight H P``.
+    """Update the covariance of INS and receiver errors, ``P - P H^T weight H P``.
 
     Args:
         P: predicted covariance.
@@ -168,7 +168,7 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
 
 
 class NoiseMixture(NamedTuple):
-    """Statistics of an innovation whose noise is a Gaussian sum."""
+    """Log-density, weights of the noise levels, and score of an innovation whose noise is a Gaussian sum."""
 
     log_density: Array
     """Log-density of the innovation on all axes, ``(...)``."""
@@ -183,10 +183,10 @@ class NoiseMixture(NamedTuple):
 def weigh_levels(
     squares: Array, axes: int, variance: Array, levels: Array, probabilities: Array
 ) -> NoiseMixture:
-    """Return responsibilities of the noise levels, log-density and score of an innovation.
+    """Return the posterior weights of noise levels, the log-density and the score of an innovation.
 
-    The terms are scaled by the exponential of the highest level, which is the largest of them, so that no innovation,
-    however large, makes all of them vanish.
+    The terms are scaled by the exponential of the highest level, so that no innovation makes all of them
+    vanish.
 
     Args:
         squares: squared innovation, summed over the axes, m^2, ``(...)``.

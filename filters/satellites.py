@@ -16,7 +16,7 @@ With the unit vectors u_j from the user to the satellites and the design matrix 
 covariance of a single-epoch fix is ``(G^T G)^-1`` in units of the pseudorange variance; the roots of its
 diagonal are the dilutions of precision (Kaplan and Hegarty, Understanding GPS/GNSS, 2017, section 11.2.1).
 
-Plain NumPy: ephemerides are constants of an experiment, tabulated once.
+Plain NumPy.
 """
 
 from collections.abc import Sequence
@@ -38,19 +38,16 @@ PLANE_SHIFT = numpy.deg2rad(15.0)
 
 
 def orbit_radius() -> float:
-    """Return the radius of the circular orbits, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
+    """Return the radius of the circular satellite orbits, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
     return (GRAVITATIONAL_PARAMETER * (PERIOD / (2.0 * numpy.pi)) ** 2) ** (1.0 / 3.0)
 
 
 def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]:
-    """Return the Earth-fixed positions, m, and velocities, m/s, of satellites over time, ``(3, S, K)`` each.
+    """Return Earth-fixed positions, m, and velocities, m/s, of satellites, ``(3, S, K)`` each.
 
     Args:
         slots: S slot numbers from 1 to 24.
         time: time since t = 0, s, ``(K,)``.
-
-    Returns:
-        Position, m, and velocity relative to the rotating Earth, m/s, each ``(3, S, K)``.
 
     Raises:
         ValueError: if a slot is not in the constellation.
@@ -78,7 +75,8 @@ def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]
 def local_orbits(
     slots: Sequence[int], time: Array, latitude: float, longitude: float, height: float
 ) -> tuple[Array, Array]:
-    """Return positions and velocities of satellites over time in the east-north-up frame of a site.
+    """Return east-north-up positions, m, and velocities, m/s, of satellites at a site over time,
+    ``(3, S, K)`` each.
 
     Args:
         slots: S slot numbers from 1 to 24.
@@ -86,9 +84,6 @@ def local_orbits(
         latitude: latitude of the site, rad.
         longitude: longitude of the site, rad.
         height: height of the site, m.
-
-    Returns:
-        Position, m, and velocity, m/s, each ``(3, S, K)``.
     """
     position, velocity = earth_fixed_orbits(slots, time)
     rotation = east_north_up(latitude, longitude)

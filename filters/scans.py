@@ -1,7 +1,6 @@
 """Backward recursions over the scans of a track, compiled for NumPy arrays.
 
-A long recursion on NumPy arrays is compiled: one native call processes many scans. Apart from the track and the result
-memory does not grow with the number of scans.
+A long recursion on NumPy arrays is compiled: one native call processes many scans.
 
 Shapes: a time axis of K scans stands before the batch, ``(..., K, N)``.
 """
@@ -30,7 +29,7 @@ TOGETHER = 8192
 
 
 class Scans(Sequence[Any]):
-    """Sequence of the scans of a track, each as arrays ``(..., N)`` made on first use.
+    """Sequence of the scans of a track, each a view of nested arrays made on first use, ``(..., N)``.
 
     Args:
         arrays: nested tuples of arrays ``(K, ..., N)``.
@@ -56,14 +55,14 @@ class Scans(Sequence[Any]):
 
 
 def stack_scans(scans: Sequence[Any]) -> Any:
-    """Return nested arrays ``(..., N)`` of each scan stacked along a time axis, ``(..., K, N)``."""
+    """Stack the nested arrays ``(..., N)`` of each scan along a time axis, ``(..., K, N)``."""
     if isinstance(scans, Scans):
         return map_nested(lambda values: numpy.moveaxis(values, 0, -2), scans.arrays)
     return map_nested(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
 
 
 def join(stretches: Sequence[Any]) -> Any:
-    """Return nested arrays ``(..., scans, N)`` concatenated along the time axis."""
+    """Concatenate nested arrays ``(..., scans, N)`` along the time axis."""
     return map_nested(lambda *arrays: namespace(arrays[0]).concat(arrays, axis=-2), *stretches)
 
 
@@ -73,7 +72,7 @@ def take_scans(part: Any, scans: slice) -> Any:
 
 
 def over_time(function: Step, *parts: Any) -> Any:
-    """Return the results of a function at all scans of a track, from one call with the scans in the batch axis.
+    """Apply a function to all scans of a track in one call, with the scans in the batch axis.
 
     Args:
         function: function of nested arrays ``(..., N)`` that treats each episode separately.
@@ -88,7 +87,9 @@ def over_time(function: Step, *parts: Any) -> Any:
 
 
 def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
-    """Return a function that calls :func:`over_time` for a slice of the scans of ``parts``."""
+    """Return a function of a slice of scans, which applies ``function`` to those scans of ``parts`` in one
+    call.
+    """
     return lambda stretch: over_time(function, *(take_scans(part, stretch) for part in parts))
 
 
@@ -98,7 +99,7 @@ def _flatten_time(values: Array) -> Array:
 
 
 def repeat(part: Any, last: tuple[int, int]) -> Any:
-    """Return nested arrays broadcast to these sizes of the last two axes, which may be one."""
+    """Broadcast the last two axes of nested arrays to the sizes ``last``."""
     return map_nested(
         lambda values: namespace(values).broadcast_to(values, (*values.shape[:-2], *last)), part
     )
@@ -108,7 +109,7 @@ def repeat(part: Any, last: tuple[int, int]) -> Any:
 
 
 class Track(NamedTuple):
-    """Input of a backward recursion, made for a slice of the scans at a time."""
+    """Input of a backward recursion over the scans of a track, given by a function of slices of the scans."""
 
     scans: int
     """Number of scans K."""
@@ -127,7 +128,7 @@ def backward(
     lag: int | None = None,
     keep: Callable[[Carried], Any] = lambda carried: carried,
 ) -> Any:
-    """Run a recursion from the last scan of a track to the first; return the carried values of all K scans.
+    """Run a recursion from the last scan of a track to the first; return its values at all K scans.
 
     Args:
         step: step of the recursion; the same object in every call, since its compiled form is cached.
@@ -146,7 +147,7 @@ def backward(
         raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
     last, N, _ = track
     end = nothing_later(slice(last, last + 1))
-    compiled = _compiled(step, end) if last >= LEAST else None
+    compiled = _compile_step(step, end) if last >= LEAST else None
     carried, found = _scan(end, 0), [keep(end)]
     whole = lag is None or lag >= last
     length = max(1, TOGETHER // round_up_lanes(N)) if whole else max(lag or 1, TOGETHER // N)
@@ -154,7 +155,11 @@ def backward(
         beyond = min(first + length, last)
         if whole:
             given = track.given(slice(first, beyond))
-            some = _run(step, given, carried) if compiled is None else _run_compiled(compiled, given, carried)
+            some = (
+                _run_in_python(step, given, carried)
+                if compiled is None
+                else _run_compiled(compiled, given, carried)
+            )
             carried = _scan(some, 0)
         else:
             some = _run_lagged(compiled or step, track, nothing_later, lag or 0, slice(first, beyond))
@@ -169,7 +174,9 @@ def _scan(part: Any, place: int) -> Any:
 def _run_lagged(
     step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, scans: slice
 ) -> Carried:
-    """Return the carried values of some scans with a fixed lag, by ``lag`` steps of all these scans together."""
+    """Return carried values with a fixed lag, by ``lag`` steps in each of which all ``scans`` advance
+    together.
+    """
     last = min(scans.stop - 1 + lag, track.scans)  # of the scans that these depend on
     given, carried = track.given(slice(scans.start, last)), nothing_later(slice(scans.start, last + 1))
     end = take_scans(carried, slice(-1, None))
@@ -178,8 +185,7 @@ def _run_lagged(
     return take_scans(carried, slice(0, scans.stop - scans.start))
 
 
-def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
-    """Return the carried values of some scans, from a loop in Python."""
+def _run_in_python(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
     found = []
     for k in reversed(range(leaves(tuple(given))[0].shape[-2])):
         carried = step(*(_scan(part, k) for part in given), carried)
@@ -191,7 +197,7 @@ def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
 _traced = functools.lru_cache(16)(lambda step: CompiledFunction(step, Graph(), unchanged=0))
 
 
-def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
+def _compile_step(step: Step, carried: Any) -> CompiledFunction | None:
     """Return the compiled form of a step on NumPy arrays; None for other arrays."""
     if not AVAILABLE or any(type(values) is not numpy.ndarray for values in leaves(carried)):
         return None

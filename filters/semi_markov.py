@@ -14,9 +14,9 @@ are not mixed. With p the probabilities after the last measurement, before the n
     p'(kind, 1) = b(kind) (e + sum_d p(rest, d))                        modes that begin                       (4)
     p'(rest, 1) = (1 - b) e,  p'(rest, d + 1) = (1 - b) p(rest, d),  b = sum_kinds b(kind)                     (5)
 
-where "rest" is what the target does between modes. The exact Gaussian sum grows without end; here all hypotheses of one
-kind and age are one Gaussian with their mean and covariance, and the last age of a table stands for all beyond it. A
-table of fixed size needs no sorting.
+where "rest" is what the target does between modes. The exact Gaussian sum grows without end; here all
+hypotheses of one kind and age are one Gaussian with their mean and covariance, and the last age of a table
+stands for all beyond it.
 
 L. Campo, P. Mookerjee and Y. Bar-Shalom, State estimation for systems with sojourn-time-dependent Markov model
 switching, IEEE Trans. Automatic Control 36 (1991), 238-243, with the merging of H. A. P. Blom and Y. Bar-Shalom, The
@@ -37,7 +37,7 @@ LEAST_PROBABILITY = 1e-30
 
 
 class AgedHypotheses(NamedTuple):
-    """Estimates and probabilities of H hypotheses of one kind, by the age of the mode."""
+    """Estimates and probabilities of H hypotheses of one kind of mode, by the mode's age."""
 
     mean: Array
     """Means, ``(n, H, N)``."""
@@ -47,22 +47,22 @@ class AgedHypotheses(NamedTuple):
     """Probabilities, ``(H, N)``."""
 
     def take(self, ages: slice, state: int | None = None) -> "AgedHypotheses":
-        """Return the hypotheses of a slice of ages, with the first ``state`` components of their states."""
+        """Return the hypotheses of some ages, with the first ``state`` components of their states."""
         return AgedHypotheses(
             self.mean[:state, ages], self.covariance[:state, :state, ages], self.probability[ages]
         )
 
     def pack(self) -> "AgedHypotheses":
-        """Return the hypotheses with their covariances packed as lower triangles."""
+        """Return the hypotheses with packed covariances, ``(n (n + 1) / 2, H, N)``."""
         return self._replace(covariance=packed_covariance.pack(self.covariance))
 
     def unpack(self) -> "AgedHypotheses":
-        """Return the hypotheses with their packed covariances as full matrices."""
+        """Return the hypotheses with full covariance matrices in place of packed ones."""
         return self._replace(covariance=packed_covariance.unpack(self.covariance, self.mean.shape[0]))
 
 
 def hazards(durations: Sequence[float], ages: int) -> list[float]:
-    """Return a list of the probabilities (1) that a mode ends after each age of a table.
+    """Return the hazards (1) of dwell times: the probability that a mode ends after each age.
 
     The last age stands for all beyond it: dwell times are geometric from there, with the same mean.
 
@@ -76,7 +76,7 @@ def hazards(durations: Sequence[float], ages: int) -> list[float]:
 
 
 def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
-    """Return the hypotheses of several tables as one table; their states must have the same size."""
+    """Concatenate tables of hypotheses whose states have the same size."""
     xp = namespace(tables[0].mean)
     return AgedHypotheses(
         xp.concat([table.mean for table in tables], axis=1),
@@ -86,14 +86,14 @@ def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
 
 
 def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
-    """Return one hypothesis with the total probability, mean and covariance of several."""
+    """Merge hypotheses into one with their total probability, mean and covariance."""
     total = ordered_sum(hypotheses.probability)
     mean, covariance = imm.combine(hypotheses.mean, hypotheses.covariance, hypotheses.probability / total)
     return AgedHypotheses(mean[:, None], covariance[:, :, None], total[None])
 
 
 def grow_older(table: AgedHypotheses, new: AgedHypotheses) -> AgedHypotheses:
-    """Return the table one step later: every age increases by one, and the last two are merged.
+    """Return the table a step later: ages increase by one, ``new`` is the first, and the last two are merged.
 
     Args:
         table: table before.
@@ -117,7 +117,7 @@ class Mode(NamedTuple):
 
 
 def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses, list[AgedHypotheses]]:
-    """Return the tables of rest and of all modes after possible begins and ends of modes, equations (2) to (5).
+    """Move hypotheses between rest and modes before a step, in which modes may begin and end, (2) to (5).
 
     Args:
         rest: hypotheses of the motion between modes.
@@ -151,6 +151,6 @@ def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses,
 
 
 def _keep_possible(table: AgedHypotheses) -> AgedHypotheses:
-    """Return the hypotheses with probabilities of at least ``LEAST_PROBABILITY``."""
+    """Limit the probabilities of hypotheses from below to ``LEAST_PROBABILITY``."""
     probability = namespace(table.mean).clip(table.probability, LEAST_PROBABILITY, None)
     return table._replace(probability=probability)

@@ -15,7 +15,7 @@ R. A. Singer, Estimating Optimal Tracking Filter Performance for Manned Maneuver
 Reading: that paper names its process noise without giving it; Q is Singer's exact one.
 
 The closed forms subtract numbers that agree to (alpha T)^2 (Phi) and (alpha T)^5 (Q); below alpha T = 1 a
-series and a quadrature take their place. These are design functions of one model: scalars in, NumPy out.
+series and a quadrature take their place.
 """
 
 import math
@@ -36,9 +36,7 @@ def _check(alpha: float, T: float) -> None:
 
 
 def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
-    """Return position, velocity and acceleration after T of a unit acceleration at 0, ``(3,)``.
-
-    It is the last column of Phi.
+    """Return the last column of Phi, ``(3,)``: the state a time T after a unit acceleration.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.

@@ -37,12 +37,12 @@ def apply(A: Array, x: Array) -> Array:
 
 
 def transpose(A: Array) -> Array:
-    """Return the array with its two first axes swapped."""
+    """Swap the first two axes of an array."""
     return namespace(A).moveaxis(A, 0, 1)
 
 
 def mirror_lower(A: Array) -> Array:
-    """Return the symmetric matrix ``(n, n, ...)`` that has the lower triangle of another."""
+    """Return the symmetric matrix ``(n, n, ...)`` with the lower triangle of A."""
     xp, rows = namespace(A), range(A.shape[0])
     return xp.stack([xp.stack([A[max(i, j), min(i, j)] for j in rows]) for i in rows])
 
@@ -53,13 +53,13 @@ def outer(x: Array, y: Array) -> Array:
 
 
 def cholesky(A: Array) -> list[list[Array]]:
-    """Return the rows of the lower triangular Cholesky factor L, ``A = L L^T``.
+    """Return the Cholesky factor L of ``A = L L^T`` as a list of rows, without the zeros above the diagonal.
 
     Args:
         A: symmetric positive definite, ``(n, n, ...)``; its lower triangle is read.
 
     Returns:
-        Rows of L below and on the diagonal, each entry ``(...)``: ``L[i][j]`` with ``j <= i``.
+        ``L[i][j]`` with ``j <= i``, each ``(...)``.
     """
     xp = namespace(A)
     columns: list[Array] = []

@@ -6,9 +6,9 @@ that of the next one,
 
     G = P F^T P'^-1,  x^s = x + G (x^s_next - x'),  P^s = P + G (P^s_next - P') G^T
 
-The covariance is written ``(I - G F) P (I - G F)^T + G (P^s_next + Q) G^T``, the same sum of what cannot become
-negative. Where P' is singular (no process noise, a component that is known) any solution of ``P' G^T = F P`` gives the
-same result; the one of the Cholesky factor without its zero columns is taken.
+The covariance is computed as ``(I - G F) P (I - G F)^T + G (P^s_next + Q) G^T``, the same sum of what cannot
+become negative. Where P' is singular (no process noise, a component that is known) any solution of
+``P' G^T = F P`` gives the same result; the one of the Cholesky factor without its zero columns is taken.
 
 **Several models.** Two filters, one forward and one backward in time, as Helmick, Blair and Hoffman, Fixed-interval
 smoothing for Markovian switching systems, IEEE Trans. Information Theory 41 (1995), 1845-1855. The backward one
@@ -21,13 +21,12 @@ each L_j the exponential of a quadratic form, so that B_j is another one, exactl
 and mu_i the smoothed estimate is the mixture of all N(x_i, P_i) B_j with the weights ``mu_i p_ij integral N B_j``: it
 needs no further approximation.
 
-Approximations: the forward filter is an IMM, and the sum of B_j is replaced by one quadratic form. Reading: that one
-gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). A sum may leave an estimate less
-certain than the filter was, in some direction, because the modes disagree about the future; no likelihood of this form
-does that, and in this direction later measurements add nothing. With one model nothing is approximated. Recursions
-of the Rauch-Tung-Striebel kind mode by mode (Kim, Journal of Econometrics 60, 1994; Nadarajah, Tharmarasa, McDonald and
-Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) divide by nothing and are shorter, but let a mode without noise be
-corrected by a smoothed state that it could never have reached.
+Approximations: the forward filter is an IMM, and the sum of B_j is replaced by one quadratic form. Reading:
+that one gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). Where the sum
+would leave an estimate less certain than the filter's, in some direction, later measurements add nothing.
+Rauch-Tung-Striebel recursions mode by mode (Kim, Journal of Econometrics 60, 1994; Nadarajah, Tharmarasa,
+McDonald and Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) are shorter, but correct a mode without noise
+by a smoothed state that it could never have reached.
 
 **A fixed lag** is the same recursion begun anew L scans after each: all scans take one step together, L times over.
 
@@ -71,7 +70,7 @@ class Motion(NamedTuple):
 
 
 def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian) -> Gaussian:
-    """Return the smoothed estimate of one scan, from the filtered one and the smoothed one of the next scan.
+    """Return the smoothed estimate of one scan from its filtered estimate and the next scan's smoothed one.
 
     Args:
         filtered: estimate after the update at this scan, ``(n, N)`` and ``(n, n, N)``.
@@ -100,9 +99,6 @@ def smooth(
         lag: number of later scans that each estimate uses, fewer at the end of the track; default: all. Zero gives the
             filter's estimates.
 
-    Returns:
-        The smoothed estimates, in the same shapes.
-
     Raises:
         ValueError: for a negative lag.
     """
@@ -113,11 +109,7 @@ def smooth(
 
 
 def _track(filtered: Any, motion: Any) -> Track:
-    """Return the input of a backward recursion, from filtered estimates and motion.
-
-    ``motion`` is that of all scans, or a function of a slice of scans; an axis of one stands for equal values at all
-    scans or in the whole batch.
-    """
+    """Return the input of a backward recursion: filtered estimates and the motion of all scans or by slice."""
     K, N = filtered.mean.shape[-2:]
     whole = None if callable(motion) else repeat(motion, (K - 1, N))
 
@@ -180,7 +172,7 @@ class SmoothedBank(NamedTuple):
 def imm_step(
     filtered: GaussianMixture, arrival: Arrival, next_scan: SmoothedBank, transition: Array
 ) -> SmoothedBank:
-    """Return the smoothed estimates of an IMM at one scan, from its filtered and the next scan's smoothed ones.
+    """Return one scan's smoothed IMM estimates from its filtered ones and the next scan's smoothed ones.
 
     Args:
         filtered: estimates after the update at this scan.
@@ -252,7 +244,7 @@ def smooth_imm(
 
 
 def _imm_step_of(transition: Array) -> Step:
-    """Return the step of an IMM smoother with a transition matrix; equal matrices give the same object."""
+    """Return :func:`imm_step` for a transition matrix, cached by the matrix's numbers."""
     if isinstance(transition, numpy.ndarray):
         return _imm_step_of_numbers(transition.tobytes(), len(transition))
     return functools.partial(imm_step, transition=transition)
@@ -267,7 +259,7 @@ def _imm_step_of_numbers(numbers: bytes, modes: int) -> Step:
 
 
 def _expand_about(likelihood: QuadraticLikelihood, centre: Array) -> QuadraticLikelihood:
-    """Return the same likelihood expanded about another centre."""
+    """Expand a quadratic log-likelihood about another centre."""
     step = centre - likelihood.centre
     bent = apply(likelihood.curvature, step)
     value = likelihood.value + _dot(likelihood.gradient - 0.5 * bent, step)
@@ -288,7 +280,7 @@ def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticL
 
 
 def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -> QuadraticLikelihood:
-    """Return the likelihood as a function of the state one scan before, without the process noise, about ``centre``."""
+    """Return the likelihood as a function of the state one scan before, the process noise integrated out."""
     root = semidefinite_root(motion.Q)
     bent = product(likelihood.curvature, root)
     inner = semidefinite_root(_identity(centre) + product(transpose(root), bent))
@@ -388,7 +380,8 @@ def _rotate(rows: list[list[Array]], columns: list[list[Array]], p: int, q: int)
 
 
 def semidefinite_root(A: Array) -> Array:
-    """Return the lower triangular L with ``A = L L^T`` of a semidefinite matrix; columns with a zero pivot are zero.
+    """Return the lower triangular L with ``A = L L^T`` of a semidefinite matrix, zero in columns with a zero
+    pivot.
 
     Args:
         A: symmetric positive semidefinite matrix, ``(n, n, ...)``; a pivot within rounding counts as zero.
@@ -444,7 +437,7 @@ def _solve(L: Array, b: Array) -> Array:
 
 
 def _log_diagonal(L: Array) -> Array:
-    """Return half the logarithm of the determinant of ``L L^T``."""
+    """Return ``log det L``, half that of ``L L^T``."""
     xp = namespace(L)
     return ordered_sum([xp.log(L[i, i]) for i in range(L.shape[0])])
 
@@ -470,5 +463,4 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _insert_axis(values: Array, axis: int) -> Array:
-    """Return the array with an axis of one inserted."""
     return namespace(values).expand_dims(values, axis=axis)

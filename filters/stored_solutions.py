@@ -1,6 +1,6 @@
 """Stored solutions of matrix equations for the shipped environments, so that they start without SciPy.
 
-To import ``scipy.linalg`` takes a quarter of a second, longer than all else before a first step.
+Importing ``scipy.linalg`` takes a quarter of a second.
 
 ``stored_solutions.json`` contains them to the last bit, with the equations' arguments. For other arguments the
 equations are solved.
@@ -19,7 +19,7 @@ FILE = Path(__file__).with_suffix(".json")
 
 
 def use_stored_solution(solve: Solve) -> Solve:
-    """Decorate a function that solves an equation, so that it returns the stored solution if there is one.
+    """Decorate a function that solves a matrix equation: it returns the stored solution where there is one.
 
     Args:
         solve: function of strings, numbers and matrices that returns a matrix or a tuple of matrices.

@@ -95,7 +95,8 @@ def limit_spread(jacobian: Array, covariance: Array, limit: float) -> Spread:
 def transform(
     mean: Array, covariance: Array, function: Callable[[Array], Array], spread: Spread = GAUSSIAN
 ) -> tuple[Array, Array]:
-    """Return mean ``(m, ...)`` and covariance ``(m, m, ...)`` of a function of a Gaussian variable.
+    """Return mean ``(m, ...)`` and covariance ``(m, m, ...)`` of a function of a Gaussian variable, by sigma
+    points.
 
     Args:
         mean: mean, ``(n, ...)``.
@@ -107,15 +108,12 @@ def transform(
 
 
 def combine(points: Array, for_mean: Sequence[Any], for_covariance: Sequence[Any]) -> tuple[Array, Array]:
-    """Return the weighted mean and covariance of points.
+    """Return the weighted mean ``(m, ...)`` and covariance ``(m, m, ...)`` of points.
 
     Args:
         points: ``(m, p, ...)``, that of the mean first.
         for_mean: weights of the points for the mean, which sum to one, p numbers or arrays ``(...)``.
         for_covariance: those for the covariance.
-
-    Returns:
-        ``(m, ...)`` and ``(m, m, ...)``.
     """
     first = points[:, 0]
     # The weights sum to one, and with a small alpha they are large: differences lose fewer digits than points.

@@ -15,9 +15,11 @@ from filtergym.reports.tables.worst import find_worst
 
 def without_times(file):
     text = file.read_text(encoding="utf-8")
-    kept, count = re.subn(r'("metric": "nanoseconds"[^{}]*?"value": )[^,]+', r"\1null", text)
+    kept, count = re.subn(
+        r'("metric": "nanoseconds"[^{}]*?"value": )[^,]+, "low": [^,]+, "high": [^,]+', r"\1null", text
+    )
     assert count
-    return re.sub(r'("nanoseconds": \[\["policy"\], \{"shape": \[\d+\], "numbers": \[)[^\]]+', r"\1", kept)
+    return re.sub(r'("nanoseconds\w*": \[\["policy"\], \{"shape": \[\d+\], "numbers": \[)[^\]]+', r"\1", kept)
 
 
 def results_of(id, names, scenario, episodes, **options):

@@ -200,7 +200,7 @@ def steered():
 
 def weights_after(bank, state, measurement, action):
     memory = act(bank, state, measurement, action).own.memory
-    return bank.own.join([memory.free.weights, memory.pulled.weights], 0)
+    return bank.own.join_groups([memory.free.weights, memory.pulled.weights], 0)
 
 
 def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
@@ -238,7 +238,7 @@ def test_hypotheses_scales_noises(steered):
     for k in chosen[::4]:
         state, measurement = scans[k]
         before = act(bank, *scans[k - 1], np.zeros(6)).own.memory
-        free, pulled = inner.change(before.free, before.pulled, measurement.number)
+        free, pulled = inner.switch_spoofing(before.free, before.pulled, measurement.number)
         free = inner.predict_part(free, noises)
         pulled = inner.predict_part(pulled, type(noises)(*(each[1:] for each in noises)))
         variances = np.array(inner.prior.levels)[:, None]
@@ -249,7 +249,7 @@ def test_hypotheses_scales_noises(steered):
             levels=levels / levels.sum(axis=0),
             reported=receiver * state.own.memory.reported,
         )
-        expected = inner.take(predicted, measurement, inner.weigh(predicted, measurement))
+        expected = inner.posterior_state(predicted, measurement, inner.weigh(predicted, measurement))
         found = act(bank, state, measurement, action).own
         np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7, atol=1e-10)

@@ -16,7 +16,7 @@ from filtergym.envs.loosely_coupled_navigation.inertial import (
     geodetic_of_local,
     inertial_recording,
     interpolate,
-    measurements_beside,
+    paired_measurements,
     regular_times,
 )
 from filtergym.filters import geodesy
@@ -212,7 +212,7 @@ def test_missing_fixes_leave_gaps():
 
 def test_a_measurement_without_a_fix_is_not_available():
     ins, fixes = np.arange(8.0).reshape(1, 4, 2) ** 2, np.array([[1.0, 2.0], [3.0, 4.0]])
-    found = measurements_beside(ins, fixes, np.array([0.5, 1.5]), np.array([[1, -1, 0]]))
+    found = paired_measurements(ins, fixes, np.array([0.5, 1.5]), np.array([[1, -1, 0]]))
     assert found["available"].tolist() == [[1.0, 0.0, 1.0]]
     assert found["fix"].tolist() == [[[3.0, 4.0], [0.0, 0.0], [1.0, 2.0]]]
     assert found["reported_deviation"].tolist() == [[1.5, 1.0, 0.5]]

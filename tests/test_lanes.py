@@ -13,7 +13,7 @@ from filtergym.envs.engine import episode_noise
 from filtergym.envs.engine.compiled import share_world
 from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import REWARD_FUNCTIONS, reference
+from filtergym.envs.engine.reward import REWARD_FUNCTIONS, reward_baseline
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -100,7 +100,7 @@ def test_a_reference_runs_beside_as_lanes_of_its_own(env_id):
     # One of two in turn: for either, programs of both algorithms are traced.
     kind = ("relative", "log-relative")[KINDS.index(env_id) % 2]
     model = make_model(env_id, backend="compiled")
-    beside = reference(kind, model)
+    beside = reward_baseline(kind, model)
     count, report, space = 24, REWARD_FUNCTIONS[kind], model.action_space
     lanes, own, other = (
         Lanes(*each) for each in ((model, count, beside), (model, count), (beside.model, count))
@@ -139,7 +139,7 @@ def test_copies_and_snapshots_go_on_as_the_original(either_way):
     noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
     for lane in range(3):
         noise.seed(lane, np.random.default_rng(lane))
-    noise.put(noise.draw_identities(range(3)))
+    noise.set_identities(noise.draw_identities(range(3)))
     noise.start()
     noise.advance()
     first, other, snapshot = noise.row, pickle.loads(pickle.dumps(noise)), noise.snapshot()

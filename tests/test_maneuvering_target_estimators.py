@@ -282,7 +282,7 @@ def test_a_deviation_is_carried_as_the_turns_carry_it(scenario, keywords):
         episode = model.act(model.measure(episode, next_row(model, rng, LANES)), np.zeros((2, LANES)))
         truth = episode.truth
         early = None if truth.scans is None else (before.scans.early, truth.scans.early)
-        carried = world.course.carry(truth.flight, truth.scan, early, velocity)
+        carried = world.course.propagate_deviation(truth.flight, truth.scan, early, velocity)
         for b in range(LANES):
             earlier, now = (0.0, 0.0) if early is None else (early[0][b], early[1][b])
             way, end = naive_carry(

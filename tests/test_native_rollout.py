@@ -1,6 +1,7 @@
 """Whole episodes in one native call are the episodes that are stepped, bit for bit."""
 
 import copy
+import itertools
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +13,7 @@ from filtergym.envs.engine import stepper
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.kinds import Policy, kind_of
 from filtergym.evaluation.running import rollout as rollouts
+from filtergym.evaluation.running import times
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import rollout, run_episodes
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -208,7 +210,7 @@ def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
     monkeypatch.setattr(rollouts.time, "process_time", lambda: clock[0])
     found = rollouts.measure_time(*given[:3], SEEDS, "imm")
     assert found.compiled
-    assert found.nanoseconds == pytest.approx(25e3 / rollouts.TIMED_EPISODES, rel=1e-9)
+    assert found.nanoseconds == pytest.approx(25e3 / rollouts.COMPILED_EPISODES, rel=1e-9)
     # A run of about ten milliseconds, were setting it up all that a first decision takes; some of them.
     assert set(flown) == {1, 5}
     assert flown.count(5) >= rollouts.TIMED_ROUNDS * rollouts.FEWEST_RUNS
@@ -217,10 +219,61 @@ def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
 @pytest.mark.parametrize("backend", ["compiled", "numpy"])
 def test_an_estimator_that_does_nothing_takes_the_least_time(backend, monkeypatch):
     """Which the time of its run less that of the world cannot fall below."""
-    monkeypatch.setattr(rollouts, "LEAST_NANOSECONDS", 1e9)
+    monkeypatch.setattr(times, "LEAST_NANOSECONDS", 1e9)
     model = make_model(problem_of(ID).task, "gain", "random", backend=backend)
     found = rollouts.measure_time(model, rollouts.IdleEstimator, "estimator", SEEDS)
-    assert found == (1e9, backend == "compiled", False)
+    assert found == (1e9, backend == "compiled", False, 1e9, 1e9)
+
+
+def test_rounds_are_repeated_while_their_times_differ(monkeypatch):
+    """The world takes 100 ns; the competitor 200 ns, or 300 in disturbed rounds."""
+    for slow, rounds, low in ((0.0, rollouts.TIMED_ROUNDS, 200.0), (100.0, rollouts.MOST_ROUNDS, 100.0)):
+        spent = itertools.cycle([300.0, 300.0 + slow, 300.0 + slow])
+        timed = lambda spent=spent: times.ProcessorTime(next(spent), True)  # noqa: E731
+        monkeypatch.setattr(rollouts, "_timed_run", lambda *_, timed=timed: timed)
+        worlds = []
+        monkeypatch.setattr(rollouts, "measure_world", lambda *_, seen=worlds: seen.append(1) or 100.0)
+        found = rollouts.measure_time(None, None, "policy", SEEDS)
+        assert found == (200.0, True, False, low, 200.0)
+        assert len(worlds) == rounds
+
+
+@pytest.mark.parametrize(
+    ("together", "world", "expected"),
+    [
+        ([300.0, 310.0, 390.0], [100.0, 104.0, 180.0], (200.0, 190.0, 204.0)),
+        ([300.0], [100.0], (200.0, 200.0, 200.0)),
+        ([100.0, 100.0, 150.0], [101.0, 140.0, 150.0], (1.0, 1.0, 38.0)),
+    ],
+)
+def test_a_net_time_is_as_uncertain_as_its_middle_round(together, world, expected):
+    found = times.net_time(together, world, True)
+    assert (found.nanoseconds, found.low, found.high) == expected
+
+
+def test_a_time_is_shorter_only_beyond_the_spread_of_both():
+    exact, unsure = times.ProcessorTime(100.0, True), times.ProcessorTime(120.0, True, low=90.0, high=125.0)
+    assert times.is_quicker(exact, times.ProcessorTime(120.0, True))
+    assert not times.is_quicker(exact, times.ProcessorTime(109.0, True))
+    assert not times.is_quicker(exact._replace(low=95.0, high=101.0), unsure)
+    assert not times.is_quicker(unsure, exact._replace(nanoseconds=140.0, low=125.0, high=141.0))
+    assert times.is_quicker(unsure, exact._replace(nanoseconds=140.0, low=126.0, high=141.0))
+    points = [
+        times.Point("a", "policy", exact._replace(low=95.0, high=101.0), 1.0),
+        times.Point("b", "policy", unsure, 0.5),
+    ]
+    assert times.front(points) == ["b"]
+
+
+def test_an_estimate_is_checked_in_the_world_of_estimators_alone(monkeypatch):
+    """Policies and references run without that check: its time must not be subtracted from theirs."""
+    kinds = []
+    run = lambda model, competitor, kind, *_: kinds.append(kind) or (lambda: times.ProcessorTime(1.0, True))  # noqa: E731
+    monkeypatch.setattr(rollouts, "_timed_run", run)
+    model = make_model(problem_of(ID).task, "gain", "random")
+    for kind in ("policy", "reference", "estimator"):
+        rollouts.measure_world(model, kind, SEEDS)
+    assert kinds == ["reference", "reference", "estimator"]
 
 
 @pytest.mark.parametrize("name", ["ManeuveringTarget", "LooselyCoupledNavigation"])

@@ -523,11 +523,11 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
 
 def test_units_of_a_reproduction_stand_in_their_places(two):
     from filtergym.evaluation.running.threads import one_thread
-    from filtergym.papers.imm_alpha_beta.experiment import fly, squares_of
+    from filtergym.papers.imm_alpha_beta.experiment import run_policy, squares_of
     from filtergym.papers.reproduction import compute_units, later
 
     asked = {
-        ("imm", 1): [later(fly, "imm", 8), 3.0],
+        ("imm", 1): [later(run_policy, "imm", 8), 3.0],
         "few": (later(squares_of, "adaptive", 8, gains=(0.3, 0.8)),),
     }
     counts = []

@@ -16,7 +16,7 @@ from models import make_model
 from filtergym.envs.contract.parameters import field_limits
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import REWARDS, reference
+from filtergym.envs.engine.reward import REWARDS, reward_baseline
 from filtergym.envs.engine.scenario_choice import find_scenario
 from filtergym.envs.interface.step_report import step_report
 
@@ -95,7 +95,7 @@ def finding(env_id, keywords, kind, rng):
     """Run three episodes with these keywords: "" if all is well, "refused: ..." or what went wrong."""
     try:
         model = make_model(env_id, **{"horizon": 60, "decision_interval": 1, **keywords})
-        lanes = Lanes(model, 3, reference(kind, model))
+        lanes = Lanes(model, 3, reward_baseline(kind, model))
     except np.linalg.LinAlgError as error:
         return f"LinAlgError: {error}"
     except ValueError as error:

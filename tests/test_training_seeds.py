@@ -244,25 +244,35 @@ def test_what_cannot_be_compared(folders, tmp_path, make_page, monkeypatch):
 
 
 def test_a_record_takes_further_algorithms(folders, tmp_path, make_page, monkeypatch):
-    """Of the same episodes; those it has already are replaced, with their curves."""
+    """Of its episodes, against its opponents; those it has already are replaced, with their curves."""
     monkeypatch.chdir(tmp_path)
     renamed = tmp_path / "other"
     shutil.copytree(folders[0], renamed)
     text = json.loads((renamed / "run.json").read_text())
     text["algorithm"] = "bptt-small"
     (renamed / "run.json").write_text(json.dumps(text))
-    arguments = ("--split", "validation", "--into", "records", "--policy", "imm", "--scenario", "random")
-    assert make_page("seeds", *folders, *arguments, "--episodes", 4)[0] == 0
+    options = ("--split", "validation", "--policy", "imm", "--scenario", "random", "--episodes", 4)
+    arguments = ("--into", "records", "--add")
+    assert make_page("seeds", *folders, *options, *arguments[:2])[0] == 0
     before = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
-    code, _, errors = make_page("seeds", renamed, *arguments, "--episodes", 4, "--add")
+    code, _, errors = make_page("seeds", renamed, *arguments)
     assert code == 0, errors
     after = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
     assert [run[0] for run in after["runs"]] == ["bptt seed 0", "bptt seed 1", "bptt-small seed 0"]
     assert {*after["curves"]} == {run[0] for run in after["runs"]}
     kept = [row for row in after["scenarios"]["random"] if not row[0].startswith(("bptt-small", "imm"))]
     assert kept == [row for row in before["scenarios"]["random"] if row[0] != "imm"]
-    assert make_page("seeds", folders[1], *arguments, "--episodes", 4, "--add")[0] == 0
+    assert make_page("seeds", folders[1], *arguments)[0] == 0
     replaced = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
     assert [run[0] for run in replaced["runs"]] == ["bptt seed 1", "bptt-small seed 0"]
-    code, _, errors = make_page("seeds", renamed, *arguments, "--episodes", 5, "--add")
-    assert (code, "the record has episodes 4, what is added 5" in errors) == (2, True)
+    assert (replaced["episodes"], replaced["split"]) == (4, "validation")
+
+    def fails(expected, *arguments):
+        code, _, errors = make_page("seeds", renamed, *arguments)
+        assert (code, errors.count("\n"), expected in errors) == (2, 1, True), errors
+
+    fails("from the record: leave out --episodes", *arguments, "--episodes", 5)
+    fails("from the record: name its folder by --into", "--add")
+    file = tmp_path / "records" / "seeds" / "ManeuveringTarget.json"
+    file.write_text(file.read_text().replace('"imm"', '"gone"'))
+    fails("make it anew from all runs, by python docs/make seeds runs/ManeuveringTarget/*-?", *arguments)

@@ -13,11 +13,9 @@ SYMLOG_VARIANCE = 0.38684360137
 class FusionAlarm(Alarm):
     """Alarm for innovations of the augmented filter that are larger, smaller or to one side.
 
-    An outage raises no alarm, since every filter observes it.
-
-    Under ``noise`` they are the steered filter's, over the deviation for the noise that the receiver reports, whatever
-    noise the agent chooses. Under ``mode`` and ``weights`` they are those of an augmented filter in the bank, which no
-    action steers. Under ``gain`` there is no such filter, and the innovations of the plain scheme are used.
+    Under ``noise`` they are the steered filter's, over the deviation by the receiver's reported noise, under
+    ``mode`` and ``weights`` those of an augmented filter in the bank, under ``gain`` those of the plain
+    scheme.
     """
 
     def __init__(self, model: Model) -> None:

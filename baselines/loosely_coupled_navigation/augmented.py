@@ -1,10 +1,7 @@
 """The augmented filter of LooselyCoupledNavigation with receiver noise as reported, or estimated.
 
-A policy under ``gain`` runs it in parallel with the plain scheme; an estimator reports it.
-
-The receiver may not report a change. So the noise is estimated from the innovations, starting from the reported
-variance; the estimate restarts when the report changes. One receiver measures all axes: an innovation is the root of
-their mean square.
+The noise is estimated from the innovations (root of the mean square of all axes), starting from the reported
+variance; the estimate restarts when the report changes.
 """
 
 from collections.abc import Iterable
@@ -29,14 +26,7 @@ LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "vari
 def with_rules(
     host: type, name: str, description: str, rules: Iterable[str] = RULES
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
-    """Return variants of a policy or estimator with each rule for the receiver's noise, and their tunable values.
-
-    Args:
-        host: its class, which takes the task, a rule, and the arguments of the rule.
-        name: name of the host, to which that of the rule is added.
-        description: description of the host, to which that of the rule is added.
-        rules: names of the rules for the receiver's noise; default: all.
-    """
+    """Return a policy's or estimator's variants with each rule for the receiver's noise, and their tuning."""
     variants, tunables = {}, {}
     for rule in rules:
         cls, words = RULES[rule]
@@ -65,12 +55,8 @@ class AugmentedMemory(NamedTuple):
 
 
 class AugmentedFilter:
-    """The augmented filter (INS error with drift and coloured rate error) without the position, which the caller
-    stores.
-
-    Args:
-        parameters: parameters of the task.
-        noise: model of the receiver's noise.
+    """Augmented filter of the INS error (position, drift, coloured rate error); the caller stores the
+    position.
     """
 
     def __init__(self, parameters: LooselyCoupledNavigationParameters, noise: MeasurementNoise) -> None:
@@ -78,16 +64,16 @@ class AugmentedFilter:
         self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
-        """Return the filter's memory at the start of the track: zero errors with the prior covariance.
-
-        Args:
-            none: zeros, ``(A, N)``.
+        """Return the memory at the start: zero errors, of the shape ``(A, N)`` of ``none``, with the prior
+        covariance.
         """
         p, zero = self.parameters, none[0]
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
-        """Return the displacement by the estimated rate errors in a step, m, ``(A, N)``, and the predicted memory."""
+        """Predict over a step; return the displacement by the estimated rate errors, m, ``(A, N)``, and the
+        memory.
+        """
         p, s = self.parameters, self.parameters.sampling
         P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
@@ -96,7 +82,7 @@ class AugmentedFilter:
     def update(
         self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
     ) -> tuple[Array, AugmentedMemory]:
-        """Return the correction of the position by a measurement, m, ``(A, N)``, and the updated memory.
+        """Update with a measurement; return the correction of the position, m, ``(A, N)``, and the memory.
 
         Args:
             memory: memory after :meth:`predict`.

@@ -26,14 +26,7 @@ class Navigator(NamedTuple):
 
 
 def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
-    """Return log-likelihood and NIS of a fix; NaN where there is none.
-
-    Args:
-        innovation: measurement less prediction, m, ``(A, N)``.
-        variance: its variance for each axis, m^2, ``(N,)``.
-        available: one where there is a fix, ``(N,)``.
-        xp: array namespace.
-    """
+    """Return log-likelihood and NIS of a position fix; NaN where there is none."""
     there, axes = available > 0.0, innovation.shape[0]
     S = xp.where(there, variance, 1.0)
     nis = ordered_sum(innovation * innovation) / S
@@ -52,12 +45,12 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial) -> Navigator:
-        """Return the state at the start of the track, where INS and reference have equal positions."""
+        """Return the state at the start of the track, with zero INS error."""
         rates = self.filter.start(0.0 * initial.mean)
         return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: Navigator, inputs: FilterInput) -> Navigator:
-        """Predict by the INS increment, update with the fix if there is one, and return the state."""
+        """Predict by the INS increment, update with the fix if there is one; return the state."""
         measurement = inputs.measurement
         displacement, predicted = self.filter.predict(state.rates)
         position = state.mean + (measurement.increment - displacement)

@@ -63,8 +63,8 @@ def recovery_times(
         longest: largest number of samples, which is the result for a run that does not recover within it.
 
     Returns:
-        ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
-        for episodes without an outage, or with less than ``longest + hold`` samples after it.
+        ``(episodes,)``; zero where the error was small at once; NaN without an outage, or fewer than
+        ``longest + hold`` samples after it.
     """
     episodes, steps = error.shape
     ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
@@ -81,12 +81,7 @@ def recovery_times(
 
 
 def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
-    """Return a boolean mask ``(episodes, time)``: the NIS over the last ``WINDOW`` fixes exceeds its limit.
-
-    Args:
-        nis: normalised innovation squared, NaN without a fix, ``(episodes, time)``.
-        degrees: degrees of freedom of the NIS of a fix.
-    """
+    """Return a mask ``(episodes, time)`` of alarms: the NIS over the last ``WINDOW`` fixes exceeds its limit."""
     sums, fixes = (
         numpy.cumsum(numpy.pad(values, ((0, 0), (WINDOW, 0))), axis=1)
         for values in (numpy.nan_to_num(nis), ~numpy.isnan(nis))
@@ -99,7 +94,7 @@ def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
 
 
 def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return detection delay of a fault, measurements, missed faults, and alarms before any fault, by name.
+    """Return delay of detection and misses of a fault, and alarms before any fault, by name.
 
     Args:
         alarm: ``(episodes, time)`` booleans.
@@ -123,7 +118,9 @@ def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's sums for the metrics, and numbers of terms, by name; empty for a bound."""
+    """Return each episode's sums, and numbers of terms, from which the metrics follow, by name; empty for a
+    bound.
+    """
     if "available" not in run or numpy.isnan(run["available"].values).all():
         return MetricInputs()
     task = make_task(LooselyCoupledNavigation, run.attrs["scenario"], **keywords_of(run))
@@ -156,7 +153,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of recovery, detection and integrity from the episodes' sums, with intervals.
+    """Return the metrics of recovery, detection and integrity with intervals.
 
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and

@@ -26,7 +26,7 @@ from .references import Matched, MatchedCovariance
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Return the :class:`GainBank` inside a model, whose control must be ``gain``."""
+    """Return the model's bank with its type; the model's control must be ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -78,7 +78,7 @@ class BestConstant(FixedGain):
 
 
 class _Variances(NamedTuple):
-    """Memory of the gain schedules."""
+    """Variances of estimate and innovations that a gain schedule carries from sample to sample."""
 
     P: numpy.ndarray
     """Variance of the estimate after the last sample, ``(N, axes)``, m^2."""
@@ -91,8 +91,8 @@ class _Variances(NamedTuple):
 class TimeVarying(Policy):
     """The plain scheme with the Riccati gain (5): high at the start of an error, settled later.
 
-    The variance follows from the equivalent intensity ``Ge``, the noise that the receiver reports and the gaps in the
-    data, not from the innovations. Without gaps and changes it depends on time only.
+    The variance follows from the equivalent intensity ``Ge``, the receiver's reported noise and gaps in the
+    data, not from the innovations.
     """
 
     control = "gain"
@@ -110,7 +110,7 @@ class TimeVarying(Policy):
         self.innovation: Reader = model.reader("innovation_in_metres")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the gain ``P / (P + R)`` as action, and the memory."""
+        """Return the Riccati gain ``P / (P + R)`` as action, and the variances as memory."""
         axes = self.loose.parameters.axes
         zero = numpy.zeros((len(observation), axes))
         if state is None:
@@ -135,7 +135,9 @@ class TimeVarying(Policy):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Return the memory, and the variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``, as reported."""
+        """Return the memory, and the variance R of the measurement noise as reported, ``(N, axes)`` or
+        ``(N, 1)``.
+        """
         return memory, reported
 
 
@@ -149,8 +151,7 @@ class TimeVaryingWhite(TimeVarying):
 class InnovationAdaptive(TimeVarying):
     """The Riccati gain with the receiver noise estimated from the innovations instead of the report.
 
-    An innovation has the variance ``P + R``; so R is the mean square over a window, less P. The window starts with the
-    reported noise as its first values.
+    R is the mean square of the innovations over a window, less P. The window starts with the reported noise.
     """
 
     def __init__(self, model: Model, window: float = 0.25) -> None:
@@ -165,7 +166,7 @@ class InnovationAdaptive(TimeVarying):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Return the memory with the average squared innovation, and R, at least a tenth of that average."""
+        """Return the memory with the mean squared innovation, and R, at least a tenth of it."""
         first = (memory.weight == 0)[:, None]
         before = numpy.where(first, P + reported, memory.squares)
         innovation = self.innovation(observation)
@@ -175,7 +176,9 @@ class InnovationAdaptive(TimeVarying):
 
 
 class _Offset(NamedTuple):
-    """Memory of :class:`AugmentedGain`."""
+    """Memory of :class:`AugmentedGain`: its augmented filter, and that filter's distance from the steered
+    estimate.
+    """
 
     offset: numpy.ndarray
     """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""
@@ -185,10 +188,9 @@ class _Offset(NamedTuple):
 class AugmentedGain(TimeVarying):
     """An augmented filter inside the policy, which steers the plain scheme towards its own estimate.
 
-    The correction of a sample is gain times innovation, and the agent observes the innovation before it acts:
-    with ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate gets the wanted correction;
-    otherwise the policy waits for an innovation of the other sign, after two samples on average. So one gain can do
-    more than weigh two sensors, but the covariance does not include this.
+    With ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate gets the wanted
+    correction; otherwise the policy waits for an innovation of the other sign. The reported covariance does
+    not include this.
     """
 
     traceable = True
@@ -200,7 +202,9 @@ class AugmentedGain(TimeVarying):
         self.filter: AugmentedFilter = AugmentedFilter(self.task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the augmented filter; return the gain that moves the steered estimate nearest to it, and the memory."""
+        """Update the augmented filter; return the gain that moves the steered estimate nearest to it, and the
+        memory.
+        """
         p = self.loose.parameters
         none = numpy.zeros((p.axes, len(observation)))
         memory = _Offset(none, self.filter.start(none))

@@ -9,8 +9,7 @@ motion from the INS:
 with the INS error (delta, beta, eta), the coloured error e of the receiver, and the deviation sigma of this
 measurement, changed, jammed or an outlier. The errors themselves and the motion stay unknown.
 
-Reading: no model of the motion is used. A filter with a model of the motion may gain a little; the manoeuvres are drawn
-so strong that the gain is small (``manoeuvre_acceleration``).
+Reading: no model of the motion is used.
 """
 
 from types import ModuleType
@@ -60,7 +59,7 @@ class _Matched:
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, truth: Truth) -> ErrorState:
-        """Return the state at the start of the track: zero INS error, with the true prior of all other errors."""
+        """Return the state at the start: zero INS error with the true prior of all errors."""
         xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
@@ -75,7 +74,9 @@ class _Matched:
     def predict_and_update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[ErrorState, Likelihood]:
-        """Predict with the true noise levels, update with the fix less its spoofing; return state and likelihood."""
+        """Predict with the true noise levels, update with the fix less its spoofing; return state and
+        likelihood.
+        """
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
@@ -110,11 +111,7 @@ class _Matched:
 
 
 class Matched(_Matched):
-    """The Kalman filter that knows the draw of the episode: the estimate of least mean square error.
-
-    The draw is the noise levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate
-    of the spoofing.
-    """
+    """The Kalman filter that knows the draw of the episode: the estimate of least mean square error."""
 
     kind = "reference"
 
@@ -132,6 +129,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Return the variance of the error of every axis, m^2, ``(A, N)``, and the memory."""
+        """Predict and update with the true noise levels; return error variances, m^2, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

@@ -26,7 +26,6 @@ class SageHusaProcessNoise(KalmanModel):
     """A Kalman filter that estimates its acceleration noise from its own corrections (Sage and Husa 1969).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration at the start, m/s^2.
         forgetting: factor on the weight of the past at each scan.
         least: smallest standard deviation of the acceleration, m/s^2.
@@ -41,13 +40,13 @@ class SageHusaProcessNoise(KalmanModel):
         self.least: float = least**2
 
     def start(self, initial: Initial) -> ProcessNoiseTrack:
-        """Return the state at the initial estimate, with the untuned process noise."""
+        """Return the state at the initial estimate, with the process noise given as argument."""
         nothing = 0.0 * initial.mean[0]
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
 
     def update(self, state: ProcessNoiseTrack, inputs: FilterInput) -> ProcessNoiseTrack:
-        """Predict with the process noise estimated so far, update, re-estimate the noise, and return the state."""
+        """Predict with the estimated process noise, update, estimate the noise again; return the state."""
         measurement = inputs.measurement
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
@@ -84,7 +83,6 @@ class VariationalBayes(KalmanModel):
     Along x and y it estimates the ratio of the true variance to that of the radar.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
         forgetting: rho, factor on the information about the noise at each scan.
         shape: half the number of measurements to which the radar's own variance is equivalent at the start.
@@ -110,7 +108,7 @@ class VariationalBayes(KalmanModel):
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
     def update(self, state: MeasurementNoiseTrack, inputs: FilterInput) -> MeasurementNoiseTrack:
-        """Predict, update mean and measurement noise together, and return the state."""
+        """Predict, update mean and measurement noise together; return the state."""
         measurement = inputs.measurement
         xp, variance, available = self.xp, measurement.variance, measurement.available
         F, unit = self.motion(measurement.interval)

@@ -16,9 +16,8 @@ ROUNDING = 1e-6
 class RadarAlarm(Alarm):
     """Alarm for a manoeuvre: faulty innovations, a better filter of higher gain, or missed and early scans.
 
-    The innovations are those of the filter with the lowest gain: larger, smaller or to one side. Fixed gains do not
-    model a scan that missed the target or came early. For filters with a covariance only innovations count: they model
-    such scans.
+    The innovations are those of the filter with the lowest gain. Missed and early scans count for fixed
+    gains, which do not model them.
     """
 
     window = 50

@@ -24,7 +24,6 @@ class DeadReckoning(KalmanModel):
     Equations: ``filters/dead_reckoning.py``. It runs on recordings with a second sensor alone.
 
     Args:
-        task: the problem.
         error_deviation: standard deviation of the slow error of the measured positions, m.
         correlation_time: correlation time of that error, s.
         drift: drift of dead reckoning, m over the root of a metre of travelled distance.
@@ -53,11 +52,11 @@ class DeadReckoning(KalmanModel):
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Return the state at the initial estimate, with the prior of the slow error."""
+        """Return the state at the initial estimate, with the prior of the positions' slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict by the odometry, update with the measured position, and return the state."""
+        """Predict by the odometry, update with the measured position; return the state."""
         measurement = inputs.measurement
         odometry = measurement.odometry
         if odometry is None:
@@ -79,11 +78,8 @@ class DeadReckoning(KalmanModel):
 def regress_odometry(recording: Recording) -> tuple[float, float]:
     """Return scale and heading offset (degrees) of a recording's odometry, by robust regression on positions.
 
-    Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the
-    fixes hardly count. Where the target does not move, 1 and 0.
-
-    Args:
-        recording: recording with a second sensor.
+    Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``. Where the target
+    does not move, 1 and 0.
     """
     measured, found, moved = recording.measurements, [], []
     for episode, rows in enumerate(recording.rows.tolist()):

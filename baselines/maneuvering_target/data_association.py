@@ -27,7 +27,7 @@ class AllPlots(KalmanModel):
     detection_probability: float = 0.9
 
     def density(self, plots: Plots) -> Array:
-        """Return the density of a scan's plots in its window, counted as at least one plot, 1/m^2, ``(N,)``."""
+        """Return the number of a scan's plots, at least one, over the area of its window, 1/m^2, ``(N,)``."""
         parameters: ManeuveringTargetParameters = self.task.parameters
         count = ordered_sum(plots.available[i] for i in range(plots.available.shape[0]))
         return self.xp.clip(count, 1.0, None) / parameters.window_area
@@ -35,7 +35,7 @@ class AllPlots(KalmanModel):
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Return the update of a predicted estimate with all plots of a scan, weighted by their probabilities."""
+        """Update a predicted estimate with all plots of a scan, weighted by their probabilities."""
         plots = measurement.plots
         if plots is None:
             return super().update_estimate(predicted, measurement, H)
@@ -43,7 +43,9 @@ class AllPlots(KalmanModel):
         return data_association.update_position(*predicted, plots, self.detection_probability, density)
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """Return the likelihood of a scan with a single plot; NaN for several, whose densities are not comparable."""
+        """Return the likelihood of a scan without clutter; NaN for several plots, whose densities are not
+        comparable.
+        """
         if measurement.plots is None:
             return super().likelihood(measurement, log_likelihood, nis)
         return Likelihood.unknown(log_likelihood)
@@ -53,7 +55,6 @@ class ProbabilisticDataAssociation(AllPlots, ConstantVelocity):
     """One Kalman filter of constant velocity that weighs all plots of a scan (Bar-Shalom and Tse 1975).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
     """
 
@@ -69,7 +70,7 @@ class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
     """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
 
     def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
-        """Return the update of every hypothesis of a table with all plots of a scan."""
+        """Update every hypothesis of a table with all plots of a scan."""
         plots = measurement.plots
         if plots is None:
             return super().update_table(table, measurement)

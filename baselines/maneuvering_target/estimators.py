@@ -20,7 +20,6 @@ class ConstantVelocity(KalmanModel):
     """One Kalman filter of constant velocity.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
     """
 
@@ -29,7 +28,7 @@ class ConstantVelocity(KalmanModel):
         self.variance: float = acceleration**2
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict to a scan, update with its measurement, and return the state."""
+        """Predict to a scan and update with its measurement; return the state."""
         F, Q = self.motion(inputs.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
         return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
@@ -50,7 +49,6 @@ class KalmanInteractingMultipleModel(KalmanModel):
     """The usual IMM over two Kalman filters of constant velocity, without and with white acceleration.
 
     Args:
-        task: the problem.
         accelerations: standard deviation of the acceleration of each filter, m/s^2.
         stay: probability of each mode to last another scan; all others are equally likely next.
     """
@@ -72,13 +70,15 @@ class KalmanInteractingMultipleModel(KalmanModel):
         self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return an estimate of position and velocity extended to the common state of all filters, ``(n, N)``."""
+        """Extend an estimate of position and velocity to the common state of all filters; here it is the
+        same.
+        """
         return mean, covariance
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(n, M, N)``; return the updates."""
+        """Predict every filter from its mixed state ``(n, M, N)`` and update it; return the M updates."""
         F, Q = self.motion(measurement.interval)
         return [
             self.update_estimate(
@@ -88,7 +88,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Return the state at the start of a track: all filters at the initial estimate, with prior probabilities."""
+        """Return the state at the start: all filters at the initial estimate, with prior probabilities."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -100,9 +100,9 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, inputs: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle (mix, predict, update) with a scan, and return the state.
+        """Run one IMM cycle with a scan (mix, predict, update, combine); return the state.
 
-        The normalised innovation squared is the filters' mean by their posterior weights.
+        NIS is the filters' mean by posterior weights.
         """
         xp, measurement = self.xp, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
@@ -123,13 +123,12 @@ class KalmanInteractingMultipleModel(KalmanModel):
 class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     """IMM over quiet and noisy constant velocity and an extended Kalman filter of the coordinated turn.
 
-    The filters differ in dimension. Reading: one of constant velocity counts as one of five states whose turn rate
-    has mean zero and the variance of a turn that begins, independent of the rest, and discards what is mixed into it
-    (unbiased mixing: Yuan, Bar-Shalom, Willett and others, IEEE Trans. AES 48, 2012, 3250-3267; Granström, Willett and
-    Bar-Shalom, IEEE Trans. AES 51, 2015, 2975-2986), not as one with a turn rate of zero and no variance.
+    Reading: a filter of constant velocity counts as one of five states whose turn rate has mean zero and the
+    variance of a turn that begins, and discards the turn rate that is mixed into it (unbiased mixing: Yuan,
+    Bar-Shalom, Willett and others, IEEE Trans. AES 48, 2012, 3250-3267; Granström, Willett and Bar-Shalom,
+    IEEE Trans. AES 51, 2015, 2975-2986), not as one with a turn rate of zero and no variance.
 
     Args:
-        task: the problem.
         accelerations: standard deviation of the acceleration of each filter, the turn's last, m/s^2.
         turn_rate_start: standard deviation of the turn rate of a turn that begins, degrees/s.
         turn_rate_change: standard deviation of its change from scan to scan, degrees/s.
@@ -149,13 +148,15 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return an estimate with the turn rate of straight flight as fifth component."""
+        """Append an independent turn rate, of mean zero and the variance of a turn that begins, as fifth
+        component.
+        """
         return coordinated_turn.augment_turn_rate(mean, covariance, self.turn_variance)
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(5, 3, N)``; return the updates."""
+        """Predict every filter from its mixed state ``(5, 3, N)`` and update it; return the three updates."""
         results = []
         for straight in super().predict_and_update(mean[:4], covariance[:4, :4], measurement):
             mean5, covariance5 = self.augment(straight.mean, straight.covariance)

@@ -1,8 +1,7 @@
 """Filters whose parameters are fitted to a log of positions, and the limits of these.
 
-Limits follow from the log: an acceleration of ``r / T^2`` moves a target by the deviation r of a measurement within an
-interval T. A far smaller acceleration is a straight line to the sensor, with a far larger one the filter follows every
-measurement.
+Limits follow from the log: an acceleration of ``r / T^2`` moves a target by the deviation r of a measurement
+within an interval T.
 """
 
 import dataclasses
@@ -32,8 +31,8 @@ class ConstantAcceleration(KalmanModel):
     """One Kalman filter of constant acceleration.
 
     Args:
-        task: the problem.
-        jerk: standard deviation of the change of the acceleration in a second, constant from scan to scan, m/s^3.
+        jerk: standard deviation of the change of the acceleration in a second, constant from scan to scan,
+            m/s^3.
         acceleration: standard deviation of the acceleration at the start, m/s^2.
     """
 
@@ -56,7 +55,7 @@ class ConstantAcceleration(KalmanModel):
         return super().start(Initial(*augmented))
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict to a scan, update with its measurement, and return the state."""
+        """Predict to a scan and update with its measurement; return the state."""
         xp, T = self.xp, inputs.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
         half = 0.5 * T**2
@@ -193,17 +192,11 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
-    """Return the family of the filter that uses odometry and models slow errors of the positions.
+    """Return the family of filters with odometry and slow errors of the positions, with limits for a
+    recording.
 
-    Limits are narrow where a log contains little information. In a log of an hour an error that lasts for more than
-    five minutes cannot be distinguished from another position. Dead reckoning errs by 3 to 10 m after a hundred. A
-    drift fitted too small harms more than one too large, and the likelihood may prefer it where errors are no
-    Gauss-Markov process.
-
-    Args:
-        recording: recording with a second sensor; None: any.
-        T: interval between measurements, s.
-        r: standard deviation of a measurement, m.
+    Limits are narrow where a log contains little information. An error that lasts for more than five minutes
+    cannot be distinguished from another position. A drift fitted too small harms more than one too large.
     """
     scale, heading = (1.0, 0.0) if recording is None else regress_odometry(recording)
     shortest = min(2.0 * T, 10.0)

@@ -36,7 +36,8 @@ def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
 
 
 def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
-    """Return the index of the first of ``LASTING`` scans in a row beyond ``CUTOFF``, ``(episodes,)``; -1 without any.
+    """Return the first of ``LASTING`` scans in a row with an error beyond ``CUTOFF``, ``(episodes,)``; -1
+    without.
 
     Args:
         distance: distance between target and track, m, ``(episodes, time)``.
@@ -50,7 +51,7 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; empty without clutter and for a bound."""
+    """Return what the metrics in clutter need of each episode; empty without clutter and for a bound."""
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))
@@ -64,7 +65,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of tracks in clutter from the episodes' terms, with intervals.
+    """Return the metrics in clutter with intervals: GOSPA, lost tracks and false associations.
 
     ``gospa``: mean over scans and episodes, m. ``track_loss_rate``: share of episodes with ``LASTING`` scans in a row
     whose error exceeds ``CUTOFF``; ``track_loss_scan``: median of the first of them, over the tracks lost.

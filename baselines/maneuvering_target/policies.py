@@ -40,12 +40,12 @@ class InteractingMultipleModel(Policy):
         self.log_predicted: Reader = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the posterior mode probabilities ``(N, M)`` from an observation, by Bayes' rule."""
+        """Return the posterior mode probabilities ``(N, M)`` by Bayes' rule."""
         log_predicted, log_likelihood = self.log_predicted(observation), self.log_likelihood(observation)
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the posterior mode probabilities as action, the weights of the filters."""
+        """Return the posterior mode probabilities as action (weights of the filters), and no memory."""
         return self.probabilities(observation), None
 
 
@@ -65,7 +65,7 @@ class ZeroEvidence(PaperAction):
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Return the :class:`GainBank` inside a model, whose control must be ``gain``."""
+    """Return the model's bank with its type; the model's control must be ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -81,14 +81,14 @@ class FixedGain(ConstantPolicy):
 
 
 class FixedLow(FixedGain):
-    """The smallest of the bank's gains, constant."""
+    """The smallest of the bank's gains, as constant action."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, min(model.task.parameters.gains))
 
 
 class FixedHigh(FixedGain):
-    """The largest of the bank's gains, constant."""
+    """The largest of the bank's gains, as constant action."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, max(model.task.parameters.gains))
@@ -124,7 +124,9 @@ class AdaptiveGain(Policy):
         self.available: Reader = model.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the next gain of the ramp as action, restarted at an alarm, and the memory."""
+        """Return the next gain of the ramp, which an alarm restarts, as action; the memory is the step of the
+        ramp.
+        """
         step = numpy.where(start, 0, 0 if state is None else state)
         alarm = self.squared(observation)[:, 0] > self.threshold
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)
@@ -138,8 +140,8 @@ class AdaptiveGain(Policy):
 class RearmingAdaptiveGain(AdaptiveGain):
     """The paper's comparator with a ramp that an alarm restarts while it runs: an equally ordinary detector.
 
-    Reading: the paper sets alpha to the larger gain "if a manoeuvre is detected" and makes no exception for the first
-    ramp, so an alarm restarts that one, too. An alarm at the first scan has no effect, since the ramp begins there.
+    Reading: the paper sets alpha to the larger gain "if a manoeuvre is detected" and makes no exception for
+    the first ramp, so an alarm restarts that one, too.
     """
 
     rearm = True

@@ -17,7 +17,7 @@ uses.
 
 
 class TurnMemory(NamedTuple):
-    """State of :class:`KnownTurn`."""
+    """State of :class:`KnownTurn`: its estimate, and the truth at the last scan."""
 
     mean: Array
     covariance: Array
@@ -29,13 +29,13 @@ class TurnMemory(NamedTuple):
 class KnownTurn(KalmanModel):
     """The Kalman filter that knows the manoeuvres of the episode: the optimal one, given these.
 
-    It knows begin, end and kind of each: the acceleration of thrust, the rate of a turn. Then the flight has no random
-    disturbance. With x the state, z the given state of the target and F the transition that turns a deviation of the
-    velocity as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
-    prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero in a turn.
-    Of the measurements it knows the variances at the true position, the scans with glint, a constant bias, and in
-    clutter the plot of the target. Of a coloured error it knows deviation and correlation time, and estimates its level
-    as two more states.
+    It knows begin, end and acceleration or turn rate of each; then the flight has no random disturbance. With
+    x the state, z the given state of the target and F the transition that turns a deviation of the velocity
+    as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
+    prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero
+    in a turn. Of the measurements it knows the variances at the true position, the scans with glint, a
+    constant bias, and in clutter the plot of the target. Of a coloured error it knows deviation and
+    correlation time, and estimates its level as two more states.
 
     Flights that are tables, such as those of aircraft, have no turn rates: there it knows the acceleration from scan to
     scan, which counts as thrust.
@@ -50,7 +50,7 @@ class KnownTurn(KalmanModel):
     disturbances = DISTURBANCES
 
     def initialise(self, inputs: FilterInput) -> TurnMemory:
-        """Return the state at the initial estimate; a coloured error is stationary from the start."""
+        """Return the state at the initial estimate; a coloured error starts with its stationary variance."""
         (mean, covariance), truth = inputs.measurement, inputs.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
@@ -69,9 +69,7 @@ class KnownTurn(KalmanModel):
         )
 
     def update(self, state: TurnMemory, inputs: FilterInput) -> TurnMemory:
-        """Predict with the known flight since the last scan, update with the measured position, and return the
-        state.
-        """
+        """Predict with the known flight, update with the measured position; return the state."""
         measurement, truth = inputs.measurement, inputs.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
@@ -80,7 +78,9 @@ class KnownTurn(KalmanModel):
             early = state.truth.scans.early, truth.scans.early
         one = xp.ones_like(truth.scan)
         identity = xp.stack([xp.stack([one, 0.0 * one]), xp.stack([0.0 * one, one])])
-        columns = [world.course.carry(truth.flight, truth.scan, early, identity[i]) for i in range(2)]
+        columns = [
+            world.course.propagate_deviation(truth.flight, truth.scan, early, identity[i]) for i in range(2)
+        ]
         by_velocity = xp.stack([xp.concat(column) for column in columns], axis=1)
         F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
         before, now = (xp.concat([state.position, state.velocity]) for state in (state.truth, truth))
@@ -115,14 +115,11 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Return the bound's memory at the start of the track, the initial covariance."""
+        """Return the initial covariance, as the bound's memory."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Return the bound on the variances after this scan, and the memory, by the recursion at the true position.
-
-        A scan that missed the target adds no information.
-        """
+        """Predict and update at the true position; return the bound on variances, and the covariance."""
         world = self.task.world
         assert isinstance(world, RadarWorld)
         predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])

@@ -1,7 +1,6 @@
 """Smoothers of ManeuveringTarget: its Kalman filters with later scans.
 
-They are not causal. Their forward passes are those estimators, so that with lag zero they return the same estimates;
-for scans that missed the target they only predict, backward too.
+Their forward passes are those estimators; with lag zero they return the same estimates.
 """
 
 from collections.abc import Sequence
@@ -26,7 +25,6 @@ class ConstantVelocitySmoother(ConstantVelocity):
     """One Kalman filter of constant velocity with white acceleration, smoothed (Rauch, Tung and Striebel 1965).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
         lag: number of later scans that each estimate uses; default: all of them.
     """
@@ -44,7 +42,9 @@ class ConstantVelocitySmoother(ConstantVelocity):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
     ) -> tuple[Array, Array]:
-        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
+        """Return means ``(4, K, N)`` and covariances of a track, smoothed with all later scans or those within
+        the lag.
+        """
         filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
         motion = scans.by_stretches(self._motion, filtered.mean, scans.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
@@ -55,7 +55,6 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     """The usual IMM over two Kalman filters of constant velocity, smoothed by a second filter backward in time.
 
     Args:
-        task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
         **arguments: arguments of :class:`.KalmanInteractingMultipleModel`.
     """
@@ -67,12 +66,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self.lag = lag
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return transition and process noise of every filter over intervals.
-
-        Args:
-            mixed: mean from which each filter starts, ``(n, M, N)``.
-            T: intervals, s, ``(N,)``.
-        """
+        """Return transition and process noise of every filter over intervals, and the predicted means."""
         F, unit = self.motion(T)
         Q = self.xp.stack([variance * unit for variance in self.variances], axis=2)
         F = F[:, :, None]
@@ -95,7 +89,9 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
-        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
+        """Return means ``(4, K, N)`` and covariances of a track, smoothed with all later scans or those within
+        the lag.
+        """
         filtered = smoothing.GaussianMixture(*scans.stack_scans(states)[3:])
         arrival = scans.by_stretches(self._arrival, filtered, scans.stack_scans(measurements))
 
@@ -114,13 +110,14 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
     transition is zero there, and its noise is the variance of a turn that begins.
 
     Args:
-        task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
         **arguments: arguments of :class:`.KalmanTurnInteractingMultipleModel`.
     """
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return transition and process noise of every filter; arguments of :meth:`KalmanIMMSmoother.motions`."""
+        """Return transition, process noise and predicted mean of every filter; see
+        :meth:`KalmanIMMSmoother.motions`.
+        """
         xp = self.xp
         F, unit = self.motion(T)
         nothing = 0.0 * unit[0]

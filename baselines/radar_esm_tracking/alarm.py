@@ -26,10 +26,9 @@ LEAST = 1e-300
 class ClassAlarm(Alarm):
     """Alarm for a wrong class, for ESM decisions that are all on one type, and for too many rejected decisions.
 
-    A class is wrong where another one explains the radar better than the weights in force. The paper draws the type of
-    a decision anew every time. The bearing gate rejects decisions.
+    A class is wrong where another one explains the radar better than the weights in force.
 
-    Radar errors that no class explains raise no alarm: other weights of the classes cannot correct them.
+    Radar errors that no class explains raise no alarm.
     """
 
     window = 1000  # a detected condition lasts as long as the episode
@@ -69,7 +68,9 @@ class ClassAlarm(Alarm):
         return numpy.stack([another, one_type, refusals], axis=1)
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratio, from all ESM decisions so far, of one type to types drawn anew."""
+        """Return the log-likelihood ratio, from all ESM decisions so far, of one constant type to types drawn
+        anew.
+        """
         counts = COUNT_UNIT * used_count.T
         fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts
@@ -94,5 +95,5 @@ class InnovationsAlarm(Alarm):
 
 
 def make_alarm(model: Model) -> Alarm:
-    """Return the alarm for a model: :class:`InnovationsAlarm` under ``hypotheses``, else :class:`ClassAlarm`."""
+    """Make the alarm for a model: :class:`InnovationsAlarm` under ``hypotheses``, else :class:`ClassAlarm`."""
     return InnovationsAlarm(model) if model.control == "hypotheses" else ClassAlarm(model)

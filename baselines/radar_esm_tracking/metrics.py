@@ -24,7 +24,7 @@ TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 
 
 def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Return the ratio of means over episodes to shares, ``(1 + resamples,)``; NaN where a share is zero."""
+    """Return ``means / shares``, ``(1 + resamples,)``; NaN where a share is zero."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return means / shares
 
@@ -36,15 +36,15 @@ def time_quantile(
     seconds: numpy.ndarray,
     share: float,
 ) -> IntervalEstimate:
-    """Return the time by which a condition holds in a share of the chosen episodes; infinite where too few reach it,
-    NaN without any.
+    """Return the time by which a share of the counted episodes reaches a condition; infinite where too few
+    do.
 
     Args:
         bootstrap: resamples of the episodes.
-        first: index of the first time at which the condition holds, or the number of times, ``(episodes,)``.
+        first: index of the first time with the condition, or the number of times, ``(episodes,)``.
         is_counted: whether an episode counts, ``(episodes,)`` booleans.
         seconds: times, s, ``(T,)``.
-        share: share, such as 0.5 for the median.
+        share: share of the episodes.
     """
     times = numpy.append(seconds, math.inf)[first]
     return bootstrap.interval(bootstrap.quantiles(times, share, is_counted))
@@ -77,12 +77,14 @@ def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
 
 
 def _group_masks(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Return boolean masks ``(..., 1 + classes)``: true for all targets, then for each true class."""
+    """Return masks ``(..., 1 + classes)``: all targets, then those of each true class."""
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; none for a bound, no probabilities for a reference."""
+    """Return each episode's numbers from which the metrics follow, by name; none for a bound, fewer for a
+    reference.
+    """
     if _missing(run, "true_class"):
         return MetricInputs()
     true_class = run["true_class"].values.astype(int)
@@ -144,7 +146,7 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
-    """Return the index of each of :data:`TIMES` within the episode, by its time, s."""
+    """Return the index of each of :data:`TIMES` among the measurements, by its time, s."""
     found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
     return {moment: int(at[0]) for moment, at in found.items() if len(at)}
 
@@ -154,7 +156,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics from the episodes' terms: errors by true class, recognition, and calibration.
+    """Return the metrics of all episodes with intervals: errors by true class, recognition, and calibration.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of

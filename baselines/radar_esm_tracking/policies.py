@@ -29,7 +29,7 @@ class QuasiOptimal(PaperAction):
 
 
 class FixedWeights(ConstantPolicy):
-    """The uniform combination of the filters, constant."""
+    """Policy of equal, constant weights of all filters."""
 
     control = "weights"
 
@@ -60,36 +60,37 @@ class _Posterior(Policy):
         )
 
     def radar(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of each class from all radar measurements so far, up to a constant, ``(M, N)``."""
+        """Return the log-likelihood of each class by all radar measurements so far, up to a constant,
+        ``(M, N)``.
+        """
         return self.accumulated(observation).T
 
     def counts(self, observation: numpy.ndarray, refused: float = 0.0) -> numpy.ndarray:
-        """Return the counts of ESM decisions for each type, with weight ``refused`` for rejected ones, ``(J, N)``."""
+        """Return the number of ESM decisions on each type, rejected ones with weight ``refused``, ``(J, N)``."""
         shown = self.used_count(observation) + refused * self.refused_count(observation)
         return COUNT_UNIT * shown.T
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class from an observation, up to a constant, ``(M, N)``."""
+        """Return the log-probability of each class, up to a constant, ``(M, N)``, from an observation."""
         raise NotImplementedError
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the class probabilities as action, the weights of the filters."""
         return imm.softmax(self.log_posterior(observation)).T, None
 
 
 class RadarOnly(_Posterior):
-    """Class probabilities from the radar's innovations alone."""
+    """Policy of class probabilities from the radar's innovations alone."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class from prior and radar, up to a constant, ``(M, N)``."""
+        """Return the log-probability of each class by prior and radar, up to a constant, ``(M, N)``."""
         return self.log_prior + self.radar(observation)
 
 
 class EsmOnly(_Posterior):
-    """Class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
+    """Policy of class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class from prior and ESM decisions, up to a constant, ``(M, N)``."""
+        """Return the log-probability of each class by prior and ESM decisions, up to a constant, ``(M, N)``."""
         return self.log_prior + self.log_esm @ self.counts(observation)
 
 
@@ -101,15 +102,16 @@ class Ungated(_Posterior):
     """
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class from prior, radar, and all ESM decisions, ``(M, N)``."""
+        """Return the log-probability of each class by prior, radar and all ESM decisions, up to a constant,
+        ``(M, N)``.
+        """
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
 
 
 class JointType(_Posterior):
-    """Posterior over type and class together: right where a target has one type.
+    """Policy of the joint posterior of type and class: right where a target has one type.
 
     Args:
-        model: the environment's model for the policy.
         refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
@@ -120,19 +122,18 @@ class JointType(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class from prior, radar, and all decisions on one type, ``(M, N)``."""
+        """Return each class's log-probability by prior, radar and one type's decisions, ``(M, N)``."""
         counts = self.esm * self.counts(observation, self.refused)
         esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
 
 
 class ForgettingJointType(JointType):
-    """Posterior over type and class together where the class may change, and the type with it: old evidence fades.
+    """Policy of the joint posterior of type and class where both may change: old evidence fades.
 
     Args:
-        model: the environment's model for the policy.
-        change: probability that the class changes from one decision to the next; by default once in 500 scans,
-            four times the length of an episode.
+        change: probability that the class changes from one decision to the next; by default once in 500
+            scans, four times the length of an episode.
         refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
@@ -145,7 +146,9 @@ class ForgettingJointType(JointType):
         self.log_start: numpy.ndarray = self.log_prior[:, None] + self.log_composition[..., None]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Update the joint posterior by radar, change of class and decisions; return class probabilities and memory."""
+        """Update the joint posterior of type and class; return the class probabilities, and the posterior as
+        memory.
+        """
         radar, counts = self.radar(observation), self.esm * self.counts(observation, self.refused)
         joint, last_radar, last_counts = (self.log_start, 0.0, 0.0) if state is None else state
         joint = numpy.where(start, self.log_start, joint)
@@ -158,13 +161,11 @@ class ForgettingJointType(JointType):
 
 
 class Leaky(_Posterior):
-    """The paper's rule (8) with class transitions: probabilities stay away from zero, so that a change of class is
-    detected.
+    """The paper's rule (8) with class transitions, so that a change of class is detected.
 
     Only the weights leak; the filters stay as they are (``class_transition`` would mix them too).
 
     Args:
-        model: the environment's model for the policy.
         leak: probability that the class changes in one scan, shared equally by the others.
         esm: weight of a decision, 0 to 1.
     """
@@ -181,7 +182,9 @@ class Leaky(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log of the last weights after radar measurement, class transition and decision, ``(M, N)``."""
+        """Return the log of last weights after radar, class transition and ESM decision, up to a constant,
+        ``(M, N)``.
+        """
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T
         predicted = self.transition.T @ imm.mode_posterior(last, this_scan)
@@ -212,7 +215,6 @@ ESTIMATORS = {
 
 
 def _tunable_bayes(name: str, prior: ClassPrior, **limits: tuple[float, float, float]) -> Tunable:
-    """Return the tunable values of the filter that uses Bayes' rule over classes and types."""
     change = (-4.0, math.log10(prior.change_rate), -1.0)
     found = tunable(
         ESTIMATORS[name], log10_change_rate=change, coloured=(0.05, prior.coloured, 0.7), **limits

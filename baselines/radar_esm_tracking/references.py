@@ -53,7 +53,9 @@ class _KnownDraw:
         )
 
     def start(self, initial: Start, truth: Truth) -> KnownClassState:
-        """Return the initial estimate of the true class's filter, with the true correlation of the first errors."""
+        """Return the state at the initial estimate, with the true class's covariance and the true correlation of
+        errors.
+        """
         mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
         white, zero = self.white(truth), 0.0 * truth.radar_correlation
         start = [[P[i, j] if i == j else zero for j in range(3)] for i in range(3)]
@@ -78,7 +80,7 @@ class _KnownDraw:
         return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
-        """Return the matrix of each lane's class, ``(3, 3, N)``, chosen from those of all classes ``(3, 3, M)``."""
+        """Select the matrix of each episode's class, ``(3, 3, N)``, from those of all classes ``(3, 3, M)``."""
         return self.xp.take(matrices, target_class, axis=-1)
 
     def white(self, truth: Truth) -> Array:
@@ -88,7 +90,9 @@ class _KnownDraw:
         return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
 
     def motion(self, truth: Truth, governed: Array) -> tuple[Array, Array]:
-        """Return transition and process noise from the last scan to this one, ``(n, n, N)``, of the class in force."""
+        """Return transition and process noise ``(n, n, N)`` from the last scan to this one, of the class
+        ``governed``.
+        """
         models = self.task.models
         F, Q = self.of(models.Phi, governed), self.of(models.Q, governed)
         if not self.coloured:
@@ -118,7 +122,7 @@ class Ideal(_KnownDraw):
     def update(
         self, memory: KnownClassState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, KnownClassState, Likelihood]:
-        """Predict under the true class, update; return mean, covariance, memory and likelihood."""
+        """Predict under the true class and update; return mean, covariance, memory and likelihood."""
         F, Q = self.motion(truth, memory.target_class)
         mean, covariance = kalman.predict(memory.mean, memory.covariance, F, Q)
         result = kalman.update(mean, covariance, measurement.radar, self.H, self.white(truth))
@@ -136,7 +140,7 @@ class KnownDrawBound(_KnownDraw):
     def update(
         self, memory: KnownClassState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, KnownClassState]:
-        """Return the bound on the variances after this scan, and the memory."""
+        """Return the bound on the variances after this scan, ``(3, N)``, and the memory."""
         F, Q = self.motion(truth, memory.target_class)
         P = bounds.predict_bound(memory.covariance, F, Q)
         P = bounds.posterior_cramer_rao_bound(P, self.H, self.white(truth))

@@ -8,9 +8,8 @@ from ..alarm import LARGER, Alarm, fault_evidence, scale_ratio
 
 
 class SensorAlarm(Alarm):
-    """Alarm for sensors: too large innovations under every hypothesis, or accelerometers that repeat a reading.
-
-    Noise never repeats exactly. Hidden satellites raise no alarm, since the filters observe which are hidden.
+    """Alarm for sensors: too large innovations under every hypothesis, or accelerometers that repeat a
+    reading.
     """
 
     window = 20

@@ -14,14 +14,13 @@ from ...envs.tightly_coupled_navigation.world import Measurement
 class HuberBank(HypothesisBank):
     """The paper's bank with thresholds of the robust update.
 
-    Without accelerometers there are as many rates as unknown velocities. One that disagrees may be noisy; where they
-    disagree on the average a manoeuvre has begun, and a robust update would not follow it.
+    Without accelerometers, where the rates disagree on the average a manoeuvre has begun, which a robust
+    update would not follow.
 
     Args:
-        task: the problem.
         thresholds: threshold of each group of sensors by its name; a group without one has plain updates.
-        manoeuvre: limit of the short average of the normalised innovation squared of a rate, under the hypothesis with
-            the smallest one; from it on updates without accelerometers are plain.
+        manoeuvre: limit of the short average of the normalised innovation squared of a rate, under the
+            hypothesis with the smallest one; from it on updates without accelerometers are plain.
     """
 
     def __init__(
@@ -56,7 +55,6 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
     See ``filters/extended_kalman.py``.
 
     Args:
-        task: the problem.
         thresholds: threshold of each group of sensors by its name; default: the usual one for all.
         manoeuvre: see :class:`HuberBank`; by default every update is robust.
     """
@@ -72,11 +70,11 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         self.bank: HuberBank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
     def start(self, initial: Initial) -> HuberState:
-        """Return the state at the start of a track: all filters of the bank at the initial estimate."""
+        """Return the state at the start: all filters of the bank at the initial estimate."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
-        """Predict and update all filters of the bank with a measurement, and return the state."""
+        """Predict and update all filters of the bank; return the state."""
         xp, measurement = self.xp, inputs.measurement
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
@@ -96,12 +94,10 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
 class HuberStuckCheck(Huber):
     """Huber's update of ranges and rates, without accelerometers that repeat their last reading.
 
-    Noise never repeats itself, so the first repeated reading proves that the sensor is stuck. Robustness alone cannot
-    detect it: a stuck accelerometer agrees with the prediction from its own readings, and the rates that contradict it
-    look like outliers.
+    The first repeated reading proves that the sensor is stuck. Robustness alone cannot detect it: a stuck
+    accelerometer agrees with the prediction from its own readings.
 
     Args:
-        task: the problem.
         rates: threshold of the pseudorange rates; that of the pseudoranges is the usual one.
         manoeuvre: see :class:`HuberBank`.
     """
@@ -112,7 +108,7 @@ class HuberStuckCheck(Huber):
         super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
     def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
-        """Predict and update all filters of the bank, without repeated accelerometer readings; return the state."""
+        """Update all filters of the bank without repeated accelerometer readings; return the state."""
         xp, forces, measurement = self.xp, self.task.sensors[2].readings, inputs.measurement
         available = measurement.available
         fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)

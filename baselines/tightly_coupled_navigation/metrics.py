@@ -25,18 +25,13 @@ LASTING = 10
 
 
 def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
-    """Return the mean of values over the mean of counts, over episodes, with its interval."""
+    """Return ``mean(values) / mean(counts)`` over episodes with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
 def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
-    """Return a boolean mask of the times at which a condition begins to hold for ``steps`` steps in a row.
-
-    Args:
-        condition: ``(episodes, time)`` booleans.
-        steps: number of steps.
-    """
+    """Return a mask of the times from which on a condition holds for ``steps`` steps in a row."""
     sums = numpy.cumsum(numpy.pad(condition, ((0, 0), (1, 0))), axis=1)
     held = numpy.zeros_like(condition)
     if condition.shape[1] >= steps:
@@ -55,10 +50,10 @@ class Switch(NamedTuple):
 
 
 def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switch]:
-    """Return every change of the true hypothesis, with the bank's delay in following it.
+    """Find every change of the true hypothesis, and the bank's delay in following it.
 
     The delay ends at the first step from which the probability of the new hypothesis exceeds one half for
-    ``LASTING`` steps (or until the next change, if that comes sooner).
+    ``LASTING`` steps or until the next change.
 
     Args:
         true_mode: ``(episodes, time)`` integers.
@@ -79,7 +74,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; empty for a bound."""
+    """Return each episode's numbers from which the metrics follow, by name; empty for a bound."""
     if str(run["kind"].values) == "bound":
         return MetricInputs()
     true_mode = run["true_mode"].values.astype(int)
@@ -110,7 +105,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
-    """Return each episode's terms of integrity, innovation correlation and fault detection, by name."""
+    """Return each episode's numbers for integrity, innovation correlation and fault detection, by name."""
     limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
@@ -130,12 +125,7 @@ def _integrity(run: "xarray.Dataset") -> Arrays:
 
 
 def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarray:
-    """Return a boolean mask of the steps at which the NIS, summed over the last ``TESTED`` steps, exceeds its limit.
-
-    Args:
-        nis: normalised innovation squared, ``(episodes, time)``.
-        degrees: its degrees of freedom, ``(episodes, time)``.
-    """
+    """Return a mask of the steps at which the NIS, summed over the last ``TESTED`` steps, exceeds its limit."""
 
     def summed(values: numpy.ndarray) -> numpy.ndarray:
         sums = numpy.cumsum(numpy.pad(values, ((0, 0), (TESTED, 0))), axis=1)
@@ -146,7 +136,9 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """Return each episode's false alarms, and whether and when its first fault is detected, by name."""
+    """Return each episode's number of false alarms, and whether and when its first fault is detected, by
+    name.
+    """
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # A fault has effects after its end: only alarms before the first fault are false.
@@ -165,11 +157,7 @@ def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Array
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
-    """Return counts of changes, of missed ones, and summed delays, s, from and to each hypothesis.
-
-    Returns:
-        ``(episodes, M, M, 3)``.
-    """
+    """Count changes, missed ones and summed delays, s, from and to each hypothesis, ``(episodes, M, M, 3)``."""
     found = numpy.zeros((episodes, len(HYPOTHESES), len(HYPOTHESES), 3))
     for s in changes:
         seen = math.isfinite(s.wait)
@@ -178,7 +166,8 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics from the episodes' terms: errors by hypothesis, adaptation, loss of track, integrity.
+    """Return the metrics of all episodes with intervals, such as errors by hypothesis, adaptation and loss of
+    track.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
     whose mean a few lost tracks dominate; ``adaptation_time`` (mean) from the first step that carries a new motion to

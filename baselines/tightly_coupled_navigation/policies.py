@@ -1,7 +1,6 @@
 """Policies of TightlyCoupledNavigation, and the table of its baselines.
 
-The paper is Moroz, adaptive multi-hypothesis measurer of an inertial-satellite navigation system; readings are
-those of the task.
+The paper is Moroz, adaptive multi-hypothesis measurer of an inertial-satellite navigation system.
 """
 
 import math
@@ -35,7 +34,7 @@ class MultiHypothesis(PaperAction):
 
 
 def chain(stay: float) -> tuple[tuple[float, ...], ...]:
-    """Return the hypotheses' transition matrix with ``stay`` on the diagonal and equal entries elsewhere."""
+    """Return a transition matrix of the hypotheses, with ``stay`` on the diagonal and equal other entries."""
     leave = (1.0 - stay) / (len(HYPOTHESES) - 1)
     return tuple(
         tuple(stay if i == j else leave for j in range(len(HYPOTHESES))) for i in range(len(HYPOTHESES))
@@ -45,7 +44,7 @@ def chain(stay: float) -> tuple[tuple[float, ...], ...]:
 class Sticky(MultiHypothesis):
     """The paper's algorithm over a chain that leaves a hypothesis once in 100 s, not once in 5 s.
 
-    The chain belongs to the bank, so an evaluation sets the task's ``transition``; elsewhere the user sets it.
+    An evaluation sets the task's ``transition``; elsewhere the user sets it.
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
@@ -55,10 +54,9 @@ class FixedRobust(ConstantPolicy):
     """The paper's probabilities over a robust update, always; accelerometers are left out while they repeat their
     reading.
 
-    The robust update ignores an outlier, and also a manoeuvre that begins; see ``HuberBank``.
+    See ``HuberBank``.
 
     Args:
-        model: the environment's model for the policy.
         accelerometers: constant action that raises their noise, at the whole reach (`noise_reach` of one).
         pseudoranges: strength of the robust update of these, 0 to 1.
         rates: strength of the robust update of their rates, 0 to 1.
@@ -75,16 +73,13 @@ class FixedRobust(ConstantPolicy):
 
 
 class NisAdaptive(Policy):
-    """Innovation-based adaptation of the noise, under the paper's probabilities.
+    """Policy of innovation-based adaptation of the sensors' noise, under the paper's probabilities.
 
     Where the short average of the normalised innovation squared exceeds ``threshold`` under every hypothesis,
-    the model and the sensors disagree. An excess of the pseudoranges is attributed to these. Rates that disagree may be
-    noisy, or right while the accelerometers stick: ``rates`` and ``accelerometers`` give the parts of the rates' excess
-    that go to either. Accelerometers that disagree may be wrong, or the first to measure a manoeuvre: ``own`` gives the
-    part of their excess that goes to them. With these three at zero it is nearly the constant action ``base``.
+    an excess of the pseudoranges raises their noise. One of the rates raises theirs, or that of the
+    accelerometers, which may stick; one of the accelerometers may also be a manoeuvre.
 
     Args:
-        model: the environment's model for the policy.
         threshold: threshold of the average per observation; a consistent filter has 1.
         rates: power of the rates' excess in their own variance.
         accelerometers: power of the rates' excess in the variance of the accelerometers.
@@ -114,7 +109,7 @@ class NisAdaptive(Policy):
         self.base = base
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the action, logarithms of factors on the sensors' noise from the excess of their NIS."""
+        """Return logarithms of factors on the sensors' noise as action, from the excess of their NIS."""
         nis = self.average_nis(observation).reshape(len(observation), -1, len(HYPOTHESES)).min(axis=2)
         ranges, rates, forces, attitude = numpy.log(numpy.maximum(nis.T / self.threshold, 1.0)) / self.nats
         action = [
@@ -142,7 +137,6 @@ HYPOTHESES_ON_FAULTS = {
 
 
 def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
-    """Return the tunable values of the bank with hypotheses on faults."""
     found = tunable(
         HYPOTHESES_ON_FAULTS[name],
         leg=(1.0, prior.leg, 10.0),

@@ -32,13 +32,13 @@ class KnownModeState(NamedTuple):
 
 
 class _KnownMode:
-    """Base of reference and bound: the true hypothesis selects the models step by step, and the state of the sensors is
+    """Base of reference and bound: the true hypothesis selects the models, and the state of the sensors is
     known.
 
-    From the step on which a manoeuvre begins, the acceleration is independent of the past; the filter knows it. A
-    manoeuvre that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
-    step; on the course "kinematic" the first one is there from the beginning of its step. Standard deviation and
-    correlation time of coloured errors of the pseudoranges are known; the errors are states.
+    The acceleration with which a manoeuvre begins is known. A manoeuvre that follows another one, or a jump,
+    takes its new acceleration at the end of a step; on the course "kinematic" the first one is there from the
+    beginning of its step. Standard deviation and correlation time of coloured errors of the pseudoranges are
+    known; the errors are states.
     """
 
     traceable = True
@@ -52,7 +52,6 @@ class _KnownMode:
         self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
-        """Return the state at the initial estimate, with the true hypothesis."""
         mean, covariance = range_errors.start(
             initial.mean,
             initial.covariance,
@@ -62,7 +61,7 @@ class _KnownMode:
         return KnownModeState(mean, pack(covariance), truth.mode)
 
     def reset_acceleration(self, track: KnownModeState, lanes: Array, acceleration: Array) -> KnownModeState:
-        """Return the state with the acceleration set to a known one in the lanes of a boolean mask."""
+        """Set the acceleration to a known one in the episodes of a mask ``lanes``; return the state."""
         xp, a = self.task.xp, gnss_ins.ACCELERATION
         new = numpy.zeros(self.size)
         new[a] = 1.0
@@ -80,13 +79,7 @@ class _KnownMode:
         )
 
     def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
-        """Return the state predicted to the present measurement under the true hypothesis.
-
-        Args:
-            truth: truth at that measurement.
-            track: state after the last measurement.
-            noises: covariance of the process noise of every hypothesis, ``(n, n, M)``.
-        """
+        """Predict the state to the present measurement under the true hypothesis."""
         xp, task, T = self.task.xp, self.task, self.task.common.T
         jumped = truth.jumped > 0.0
         at_once = (truth.mode == SINGER) & (track.mode != SINGER) & ~jumped
@@ -120,7 +113,6 @@ class _KnownMode:
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
-        """Return the expected sensor readings of a state, and the rows of their Jacobian there."""
         return range_errors.observe(
             state,
             measurement.satellite_position,
@@ -137,8 +129,8 @@ class _KnownMode:
         return self.task.constant(noises)
 
     def sensors(self, measurement: Measurement, truth: Truth) -> tuple[list[Array], list[Array]]:
-        """Return the true variance of every reading, and its availability: one where it contains information, else
-        zero.
+        """Return the true variance of every reading, and its availability, which is zero for stuck
+        accelerometers.
         """
         nominal, forces = self.task.sensor_variance, self.task.sensors[2].readings
         variance = [nominal[j] * truth.noise_factor[j] ** 2 for j in range(len(nominal))]
@@ -150,7 +142,8 @@ class _KnownMode:
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter that knows the draw of the episode: legs, faults, and all noise levels.
+    """One extended Kalman filter that knows the draw of the episode: manoeuvres, faults, and all noise
+    levels.
 
     At rest, and in straight flight on the fixed courses, which has steady increments and no noise, the bank's small
     regularising noise remains, so that the reported covariance stays invertible.

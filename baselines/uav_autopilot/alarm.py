@@ -4,9 +4,6 @@ from ..alarm import InnovationAlarm
 
 
 class AutopilotAlarm(InnovationAlarm):
-    """Alarm for innovations of a sensor that are larger, smaller or to one side.
-
-    A dropout raises no alarm, since the filter observes it.
-    """
+    """Alarm for innovations of a sensor that are larger, smaller or to one side."""
 
     window = 100

@@ -1,8 +1,7 @@
-"""Estimators of UavAutopilot: the settled filter, and some that estimate the noise of sensors and gusts in flight.
+"""Estimators of UavAutopilot: the settled filter, and some that estimate noise in flight.
 
-Each closes the loop around its own truth. No action is equivalent to the adaptive ones: an action scales the whole
-process noise, but a noisier sensor requires another change of the filter than stronger gusts. Equation numbers are
-those of ``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
+Each closes the loop around its own truth. Equation numbers are those of ``filters/noise_adaptation.py``, for
+the settled filter those of the task's paper.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -34,11 +33,11 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         self.settled: Array = task.constant(steady.posterior)[:, :, None]
 
     def start(self, initial: Start) -> Initial:
-        """Return the filter's state at the start of a track, from the initial estimate."""
+        """Return the state at the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, inputs: FilterInput) -> Initial:
-        """Return the state predicted and updated by (10) and (11), with the gain of the algebraic Riccati equation."""
+        """Predict and update by (10) and (11) with the constant gain; return the state."""
         measurement = inputs.measurement
         predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
@@ -109,7 +108,9 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
     def predict_and_update(
         self, before: SensorAware, measurement: Measurement, factor: Array | float
     ) -> Step:
-        """Predict with a factor on the disturbance's covariance, update sensor by sensor, and return the results."""
+        """Predict with a factor on the gusts' covariance, then update and estimate the noise sensor by
+        sensor.
+        """
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
         mean, covariance = predicted, carried + factor * self.scaled
@@ -134,16 +135,16 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         )
 
     def start(self, initial: Start) -> AdaptiveState:
-        """Return the filter's state at the start of a track, from the initial estimate."""
+        """Return the state at the initial estimate."""
         unknown = Likelihood.unknown(initial.mean[0])
         return AdaptiveState(initial.mean, initial.covariance, unknown, self.first_memory(initial))
 
     def first_memory(self, initial: Start) -> Any:
-        """Return the memory at the start of a track: one filter at the initial estimate."""
+        """Return the memory at the start: one filter at the initial estimate."""
         return self.start_filter(initial)
 
     def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
-        """Predict with gusts as designed, update with a measurement, and return the state."""
+        """Predict with gusts as designed and update; return the state."""
         after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, inputs.measurement, 1.0)
         likelihood = likelihood_of(inputs.measurement, log_likelihood, nis, self.xp)
         return AdaptiveState(
@@ -154,7 +155,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
 class AdaptiveGusts(AdaptiveKalman):
     """Sensor noise estimated, and the disturbance by equation (3) from the corrections of the last coordinate.
 
-    It is the gust, or the rate of plant P: the only one that the disturbance drives directly.
+    It is the gust, or the rate of plant P.
     """
 
     limits: ClassVar[tuple[float, float]] = (1.0 / 16.0, 16.0)
@@ -169,12 +170,12 @@ class AdaptiveGusts(AdaptiveKalman):
         self.last: int = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
-        """Return the memory at the start: the filter, and the gusts' level as designed."""
+        """Return the memory at the start: the filter, and a factor of one on the gusts' covariance."""
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
     def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
-        """Predict, update with a measurement, estimate the gusts' factor for the next one, and return the state."""
+        """Predict and update, then estimate the factor on the gusts' covariance; return the state."""
         (before, level), measurement = state.memory, inputs.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
             before, measurement, level.value
@@ -191,7 +192,7 @@ class AdaptiveGusts(AdaptiveKalman):
 
 
 class GustModels(NamedTuple):
-    """Filters for several levels of the gusts."""
+    """Filters for several levels of the gusts, and the probabilities of the levels."""
 
     filters: tuple[SensorAware, ...]
     probabilities: Array
@@ -199,11 +200,7 @@ class GustModels(NamedTuple):
 
 
 class GustInteractingMultipleModel(AdaptiveKalman):
-    """IMM over three levels of the gusts, in each the sensors' noise by variational Bayes.
-
-    One filter that estimates both confuses the noises: a large innovation fits either. The models differ in the
-    correlation of their innovations over time, to which their likelihoods respond.
-    """
+    """IMM over three levels of the gusts, in each the sensors' noise by variational Bayes."""
 
     def __init__(
         self,
@@ -224,7 +221,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return GustModels((self.start_filter(initial),) * 3, third)
 
     def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
-        """Run one IMM cycle over the gust levels, each with its own sensor noise, and return the state."""
+        """Run one IMM cycle over the gust levels, each with its own sensor noise; return the state."""
         xp, memory, measurement = self.xp, state.memory, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
@@ -247,7 +244,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return AdaptiveState(*combined, likelihood, after)
 
     def stack_filters(self, filters: tuple[SensorAware, ...]) -> tuple[Array, Array]:
-        """Return the filters' means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``, stacked."""
+        """Stack the filters' means to ``(n, 3, N)`` and their covariances to ``(n, n, 3, N)``."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)

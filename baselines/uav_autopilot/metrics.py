@@ -1,4 +1,4 @@
-"""Metrics of the loop of UavAutopilot, in addition to those of the estimate."""
+"""Metrics of UavAutopilot's control loop, such as output variance and detection of raised noise."""
 
 import math
 from collections.abc import Mapping
@@ -30,7 +30,9 @@ def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; none for a bound, no innovations for a reference."""
+    """Return each episode's numbers from which the metrics follow, by name; none for a bound, fewer for a
+    reference.
+    """
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return MetricInputs()
     task, slices = _task(run), slices_of(run)
@@ -62,12 +64,11 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: numpy.ndarray) -> numpy.ndarray:
-    """Return each episode's results ``(episodes, 6)`` of a test that detects raised noise from innovations.
+    """Test each episode for raised noise by its innovations; return the results ``(episodes, 6)``.
 
-    The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their variance
-    (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G. Lorden, Annals of
-    Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`. The onset is the first time that noise is raised
-    in an episode that does not begin with raised noise.
+    The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their
+    variance (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G.
+    Lorden, Annals of Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`.
 
     Args:
         nis: normalised innovation squared, NaN where no reading was received, ``(episodes, time)``.
@@ -105,7 +106,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of the control loop from the episodes' terms, with intervals.
+    """Return the metrics of the control loop with intervals, such as variances of output and control.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.
@@ -167,7 +168,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
-    """Return the unbiased variance across episodes at each time, of the data and of every bootstrap resample."""
+    """Return the unbiased variance over episodes at each time, in the data and in every bootstrap resample."""
     biased = averaged[f"{of}_square"] - averaged[of] ** 2
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 

@@ -29,16 +29,14 @@ class Kalman(PaperAction):
 
 
 class InnovationAdaptive(Policy):
-    """Process noise scaled by a window of normalised innovations squared (NIS).
+    """Policy that scales the process noise by a window of normalised innovations squared (NIS).
 
-    The logarithm of the factor is ``memory`` times the last one, plus ``weights`` times the logarithm
-    of the innovations' mean square of each sensor over an exponential window; the mean square of a
-    consistent filter is one. By default all sensors have the same positive weight, the textbook's rule: innovations
-    larger than predicted mean that the process noise is too small. It cannot distinguish gusts from a noisier sensor,
-    which requires the opposite action; tuned weights can.
+    The logarithm of the factor is ``memory`` times the last one, plus ``weights`` times the logarithm of the
+    innovations' mean square of each sensor over an exponential window; the mean square of a consistent filter
+    is one. By default all sensors have the same positive weight, the textbook's rule. Only tuned weights can
+    distinguish gusts from a noisier sensor.
 
     Args:
-        model: the environment's model for the policy.
         window: effective length of the window, measurements.
         memory: factor on the last logarithm, 0 to 1.
         offset: logarithm (base 10) of the factor when the innovations are as predicted.
@@ -68,7 +66,9 @@ class InnovationAdaptive(Policy):
         self.last_action: Reader = model.reader("action")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the logarithm of the process noise's factor as action, and the updated window."""
+        """Return the logarithm of the factor on the process noise as action, and the window's mean squares as
+        memory.
+        """
         squared = self.innovation(observation) ** 2
         # A window starts with the mean square of a consistent filter.
         mean = numpy.where(start[:, None], 1.0, 1.0 if state is None else state)
@@ -112,7 +112,6 @@ BANKS: dict[str, Any] = {
 
 
 def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
-    """Return the tunable values of the bank over noise levels."""
     found = tunable(
         BANKS[name],
         log10_gust_change=(-3.5, math.log10(prior.gust_change), -1.0),

@@ -27,7 +27,7 @@ class TrueState:
         self.task = task
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Return the initial covariance, which is reported at all times, since the error is zero."""
+        """Return the initial covariance, which is reported at all times."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Array]:
@@ -36,7 +36,7 @@ class TrueState:
 
 
 class _KnownNoise:
-    """The covariance (12) of the true plant with the present noise and the coloured errors of the sensors.
+    """Base of reference and bound: covariance (12) with the present noise and the sensors' coloured errors.
 
     A coloured error is a further coordinate of the state, which its sensor reads together with its own; its decay and
     its noise are known (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
@@ -82,7 +82,7 @@ class _KnownNoise:
         self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
-        """Return the packed initial covariance; the gust has the level of the episode's first part."""
+        """Return the packed initial covariance, with the true levels of the gust and of the coloured errors."""
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance
@@ -95,7 +95,7 @@ class _KnownNoise:
         return self.xp.concat([self.xp.ones_like(truth.state), truth.disturbances["coloured"].process.decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
-        """Return the packed covariance predicted to this measurement, with the true disturbance."""
+        """Predict the packed covariance to this measurement with the true disturbance."""
         predicted = self.xp.matmul(self.propagator, covariance)
         noise = truth.level**2 * self.scaled + self.other
         if self.size > self.n:
@@ -107,7 +107,7 @@ class _KnownNoise:
     def update_covariance(
         self, mean: Array, covariance: Array, measurement: Measurement, truth: Truth
     ) -> packed_covariance.PackedUpdate:
-        """Return the update with the readings less their constant errors, with the true sensor noise."""
+        """Update with the readings less their constant errors, by the true sensor noise."""
         return packed_covariance.update_coordinates(
             mean,
             covariance,
@@ -118,7 +118,6 @@ class _KnownNoise:
         )
 
     def sensor_variances(self, truth: Truth) -> Array:
-        """Return the variance of each sensor's white noise at this measurement, ``(m, N)``."""
         return self.variances * truth.sensor_level**2
 
 
@@ -140,7 +139,7 @@ class Matched(_KnownNoise):
         return Initial(mean, self.start_covariance(truth))
 
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
-        """Return the state predicted by (10) and (12) with the true disturbance; the covariance is packed."""
+        """Predict by (10) and (12) with the true disturbance; return the state with packed covariance."""
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
         if self.size > self.n:
             mean = self.decays(truth) * mean
@@ -160,15 +159,15 @@ class Matched(_KnownNoise):
 class KnownNoiseBound(_KnownNoise):
     """Covariance of the best estimator that knows plant and noise: the Riccati recursion.
 
-    The problem is linear and Gaussian with a known control. So this is the posterior Cramer-Rao bound, it is attained,
-    and it does not depend on the control: the filters of all policies have the same bound.
+    The problem is linear and Gaussian with a known control, so this posterior Cramer-Rao bound is attained,
+    and the same for all policies.
     """
 
     kind = "bound"
     knows: str = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Return the covariance of the true state's distribution at the start, packed, as memory."""
+        """Return the true covariance at the start, packed, as memory."""
         return self.start_covariance(truth)
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:

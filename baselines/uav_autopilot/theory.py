@@ -9,7 +9,7 @@ from ...filters import linear_systems
 
 
 class Stationary(NamedTuple):
-    """Second moments of a steady-state linear loop without command."""
+    """Variances of output and control, and mean cost, of a steady-state loop without command."""
 
     output_variance: float
     control_variance: float
@@ -18,7 +18,8 @@ class Stationary(NamedTuple):
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
-    """Return cost and variances of a policy's or reference's steady-state loop, by the Lyapunov equation; or None.
+    """Return cost and variances of a policy's or reference's steady-state loop; None where they have no
+    closed form.
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions

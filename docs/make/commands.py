@@ -158,7 +158,12 @@ def notebooks(
         console.print(f"executed {one}", soft_wrap=True)
 
 
+OF_RECORD = ("scenario", "policy", "episodes", "seed", "split")
+"""Options of :func:`seeds` that an existing record determines."""
+
+
 def seeds(
+    context: typer.Context,
     runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
     scenario: Annotated[
         list[str] | None,
@@ -182,7 +187,9 @@ def seeds(
     ] = None,
     add: Annotated[
         bool,
-        typer.Option(help="Keep the other algorithms of the existing record, of the same episodes."),
+        typer.Option(
+            help="Keep the other algorithms of the existing record, with its scenarios, opponents and episodes."
+        ),
     ] = False,
     note: Note = "",
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
@@ -206,6 +213,16 @@ def seeds(
     names: list[str | None] = [*scenario] if scenario else [None]
     scenarios = [find_scenario(problem.task, name).name for name in names]
     opponents = policy or training_seeds.default_opponents(problem)
+    name, stored = f"{SEEDS}/{bare_name(problem.id)}", None
+    if add:
+        sources = {option: context.get_parameter_source(option) for option in OF_RECORD}
+        given = [option for option, source in sources.items() if source and source.name == "COMMANDLINE"]
+        if given or into is None:
+            what = f"leave out --{given[0]}" if given else "name its folder by --into"
+            raise ValueError(f"--add takes {', '.join(OF_RECORD)} from the record: {what}")
+        stored = read_record(name, into)
+        scenarios, opponents = list(stored.data["scenarios"]), training_seeds.opponents_of_record(stored.data)
+        episodes, seed, split = (stored.data[key] for key in ("episodes", "seed", "split"))
     for file in (out, curves):
         if file is not None:
             writable_file(file)
@@ -225,9 +242,9 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         data = training_seeds.seeds_data(study, records)
-        name = f"{SEEDS}/{bare_name(problem.id)}"
-        if add:
-            data = training_seeds.merge_runs(read_record(name, into).data, data)
+        if stored is not None:
+            command, note = stored.command, note or stored.note
+            data = training_seeds.merge_runs(stored.data, data)
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
         write_record(name, made, into)
     store.clear()

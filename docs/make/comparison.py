@@ -37,9 +37,9 @@ class Comparison(NamedTuple):
 def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
     """Return the names of the competitors that the comparison page shows, in the order of its columns.
 
-    Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
-    algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
-    are in the records. A narrow screen shows only the first columns without scrolling.
+    Learned agents; the cheapest of all others in the training distribution; the paper's algorithm in all its readings;
+    it and the best constant action, tuned; the reference whose score is 1. A narrow screen shows only the first
+    columns.
     """
     problem, records = benchmark
     known, paper = problem.baselines, benchmark.paper
@@ -56,12 +56,11 @@ def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Return the records over whole episodes, by competitor, metric, component and window."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time in one scenario."""
+    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
@@ -150,11 +149,7 @@ def covariances(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparison:
-    """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
-
-    Args:
-        benchmark: the environment and its records.
-        width: width of the figure, 1 or 2 columns of a paper.
+    """Return the tables and figure of one environment: cost against the paper's algorithm, and physical errors.
 
     Raises:
         ValueError: if the paper's algorithm, or its opponents, are not among the records.
@@ -182,9 +177,8 @@ def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparis
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Return a table with a row for each scenario and the cell ``text(scenario, name)`` for each name.
-
-        With ``judged`` the first column is the verdict.
+        """Return a table with a row for each scenario: the verdict if ``judged``, and ``text(scenario,
+        name)`` by name.
         """
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
@@ -261,7 +255,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Return a record's value and interval as text of two lines, for a narrow column."""
+    """Return a record's value and interval as Markdown of two lines, for a narrow column."""
     # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
@@ -269,11 +263,7 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(benchmarks: Sequence[BenchmarkRecords], which: str) -> str:
-    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown.
-
-    Raises:
-        ValueError: for another name.
-    """
+    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown."""
     tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")

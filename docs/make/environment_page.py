@@ -1,9 +1,4 @@
-"""The tables of an environment's page, made from its code.
-
-Texts are those of the code: the meaning of controls (:class:`.Actions`), the observation blocks, the docstrings under
-the fields of parameters and measurement, the scenarios' descriptions, the first lines of policies' docstrings
-and the knowledge of references.
-"""
+"""The tables of an environment's page, made from the texts in its code."""
 
 import inspect
 import typing
@@ -31,7 +26,7 @@ def field_documentation(cls: type) -> dict[str, str]:
 
 
 def measurement_class(cls: type[Task]) -> Any:
-    """Return the NamedTuple of a task's measurement: the second part of its world's result."""
+    """Return the NamedTuple of a task's measurements, from the type of its world's result."""
     return typing.get_args(typing.get_type_hints(cls.World.advance)["return"])[1]
 
 
@@ -163,7 +158,7 @@ TABLES = {
 
 
 def causes_table() -> str:
-    """Return a table of the causes by which evaluations of all environments split costs, in Markdown."""
+    """Return a Markdown table of the causes to which evaluations attribute costs, in all environments."""
     rows = []
     for cls in catalogue().values():
         causes = Causes.of(cls(cls.Parameters())).causes
@@ -173,7 +168,7 @@ def causes_table() -> str:
 
 
 def environment_table(problem: Problem, name: str) -> str:
-    """Return the table of an environment called ``name`` (actions, fields, ...), in Markdown.
+    """Return the table ``name`` (such as actions, fields) of an environment in Markdown.
 
     Raises:
         ValueError: if there is no table of that name.

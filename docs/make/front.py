@@ -35,12 +35,7 @@ def panels_of(benchmarks: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
 
 @in_print
 def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
-    """Draw the fronts of several environments in one picture, with its legend in the empty place.
-
-    Args:
-        panels: one or several panels.
-        columns: width of the picture in columns of a paper.
-    """
+    """Draw the cost-time fronts of several environments in one picture, with the legend in the empty place."""
     figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
     cells = axes.ravel().tolist()
     for axis, panel in zip(cells, panels, strict=False):
@@ -53,10 +48,9 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
 
 
 def budgets_markdown(benchmarks: Sequence[BenchmarkRecords]) -> str:
-    """Return a table in Markdown: the classical and the learned competitor of lowest error cost within each time.
+    """Return a Markdown table: the classical and the learned competitor of lowest cost within each processor time.
 
-    A learned one is bold where its whole interval lies below that of the classical one, and a classical one in the
-    opposite case.
+    Of the two, the one whose whole interval lies below that of the other is bold.
     """
     rows = []
     for problem, records in benchmarks:

@@ -23,11 +23,7 @@ def notebook_files() -> list[Path]:
 
 
 def execute(file: Path) -> Any:
-    """Return a notebook with the output of its cells, run in an empty folder by this Python.
-
-    Raises:
-        ValueError: if a cell fails.
-    """
+    """Return a notebook with the output of its cells, run in an empty folder by this Python."""
     import nbformat
     from nbclient import NotebookClient
     from nbclient.exceptions import CellExecutionError
@@ -54,11 +50,7 @@ def execute(file: Path) -> Any:
 
 
 def write_executed(file: Path) -> None:
-    """Execute a notebook and write it with its outputs.
-
-    Raises:
-        ValueError: if a cell fails.
-    """
+    """Execute a notebook and write it with its outputs."""
     import nbformat
 
     nbformat.write(execute(file), file)

@@ -4,7 +4,8 @@
 #
 # Each finished part leaves an empty file in build/numbers/. After an interruption the same command continues, and so do
 # the long commands; to make a part again remove its file. The order follows the dependencies: values are tuned, agents are
-# trained and shipped, and only then everything is evaluated, on unseen episodes.
+# trained and shipped, and only then everything is evaluated, on unseen episodes. `make -f docs/make/numbers.mk evaluated`
+# evaluates the shipped agents without tuning or training them, and leaves out the tables of training runs where runs/ has none.
 
 BIN := .venv/bin
 JOBS ?= 2
@@ -42,25 +43,38 @@ crash_test_TightlyCoupledNavigation := --episodes 16 --steps 1000
 
 PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-esm-class-fusion uav-autopilot-kalman
 
+alone := $(filter evaluated,$(MAKECMDGOALS))
+# Prerequisites of an evaluation, which has none alone.
+after = $(if $(alone),,$(1))
+# A part that needs training runs is left out without them, with a sentence.
+with_runs = $(if $(alone),$(if $(wildcard $(1)),$(2),$(info $(2): left out, as there are no training runs $(1))),$(2))
 episodes = $(or $(episodes_$(1)),2000)
 trained = $(foreach agent,$(agents_$(1)),$(DONE)/train-$(1)-$(agent))
 shipped = $(foreach environment,$(ENVIRONMENTS),$(DONE)/ship-$(environment))
 # From a command's results to the record that pages are rendered from.
 record := $(BIN)/python docs/make record
 table := $(BIN)/python docs/make table
-finish = @mkdir -p $(DONE) && touch $@
+finish = @touch $@
+$(shell mkdir -p $(DONE))
 
-.PHONY: numbers tuned trained shipped evaluated
+.PHONY: numbers programs tuned trained shipped evaluated
 # Two long commands at once would share the same cores: each has its processes by JOBS.
 .NOTPARALLEL:
 
-numbers: tuned trained shipped evaluated
+numbers: programs tuned trained shipped evaluated
 
 tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
-evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/strongest $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/loop $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+programs:
+	@test -e $(DONE)/exported || command -v $(firstword $(cross)) > /dev/null || { echo "$(DONE)/exported needs $(firstword $(cross)): \
+	  apt-get install gcc-arm-none-eabi, or leave it out by touch $(DONE)/exported" >&2; exit 1; }
+
+evaluated: programs $(foreach name,$(ENVIRONMENTS),$(call with_runs,runs/$(name)/*-?,$(DONE)/seeds-$(name))) $(DONE)/benchmark \
+  $(DONE)/coverage $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) \
+  $(DONE)/exported $(DONE)/budgets $(DONE)/pairs \
+  $(call with_runs,runs/ManeuveringTarget/student-?,$(DONE)/students) $(call with_runs,runs/*/bptt-strongest-?,$(DONE)/strongest) \
+  $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/loop $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: the shipped files contain their commands
 
@@ -91,24 +105,24 @@ $(foreach environment,$(ENVIRONMENTS),$(eval $(call shipping,$(environment))))
 
 # --- evaluations
 
-$(DONE)/seeds-%: $(DONE)/ship-%
+$(DONE)/seeds-%: $(call after,$(DONE)/ship-%)
 	$(BIN)/python docs/make seeds runs/$*/*-? --scenario random --episodes $(call episodes,$*) --jobs $(JOBS) \
 	  --out results/seeds/$*.json --into docs/records --trust
 	$(finish)
 
 # The second command alone makes the records of all environments anew from a finished benchmark, wherever it lies.
-$(DONE)/benchmark: $(shipped)
+$(DONE)/benchmark: $(call after,$(shipped))
 	$(BIN)/filtergym benchmark --full --half-width 2 --jobs $(JOBS) --out results/full
 	$(record) results/full/results.json
 	$(finish)
 
-$(DONE)/coverage: $(DONE)/ship-ManeuveringTarget $(DONE)/ship-LooselyCoupledNavigation $(DONE)/ship-TightlyCoupledNavigation
+$(DONE)/coverage: $(call after,$(patsubst %,$(DONE)/ship-%,ManeuveringTarget LooselyCoupledNavigation TightlyCoupledNavigation))
 	$(BIN)/python benchmarks/interval_coverage.py > build/coverage.txt
 	$(table) build/coverage.txt --name interval_coverage \
 	  --command "python benchmarks/interval_coverage.py"
 	$(finish)
 
-$(DONE)/flights: $(DONE)/ship-ManeuveringTarget
+$(DONE)/flights: $(call after,$(DONE)/ship-ManeuveringTarget)
 	$(BIN)/python -m pip install --quiet --no-deps traffic
 	$(BIN)/python benchmarks/flights.py --out docs/data/flights.csv > build/flights.txt
 	$(table) build/flights.txt --name flights_smoothed --name flights_recorded \
@@ -128,7 +142,7 @@ $(DONE)/plain:
 	  "python benchmarks/plain_ppo.py --markdown --algo sac --envs 16 --seeds 1 --steps 20000"
 	$(finish)
 
-$(DONE)/harm-%: $(DONE)/ship-%
+$(DONE)/harm-%: $(call after,$(DONE)/ship-%)
 	$(BIN)/python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*) > build/harm-$*.txt
 	$(table) build/harm-$*.txt --name harm/$* \
 	  --command "python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*)"
@@ -136,7 +150,7 @@ $(DONE)/harm-%: $(DONE)/ship-%
 
 crash_test = $(strip benchmarks/crash_test.py filtergym/$*-v0 $(crash_test_$*))
 
-$(DONE)/stress-%: $(DONE)/ship-%
+$(DONE)/stress-%: $(call after,$(DONE)/ship-%)
 	$(BIN)/python $(crash_test) > build/stress-$*.txt
 	$(table) build/stress-$*.txt --name stress/$* --command "python $(crash_test)" \
 	  --note "23 alterations, of which some do not apply."
@@ -144,25 +158,25 @@ $(DONE)/stress-%: $(DONE)/ship-%
 
 cross = arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
 
-$(DONE)/exported: $(shipped)
+$(DONE)/exported: $(call after,$(shipped))
 	$(BIN)/python benchmarks/exported.py --cross "$(cross)" --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
 	  --command "python benchmarks/exported.py --cross '$(cross)' --out docs/data/exported.csv"
 	$(finish)
 
-$(DONE)/budgets: $(ENVIRONMENTS:%=$(DONE)/tune-%)
+$(DONE)/budgets: $(call after,$(ENVIRONMENTS:%=$(DONE)/tune-%))
 	$(BIN)/python benchmarks/training_budgets.py --runs runs/budgets > build/budgets.txt
 	$(table) build/budgets.txt --name training_budgets --command "python benchmarks/training_budgets.py"
 	$(finish)
 
-$(DONE)/pairs: $(shipped)
+$(DONE)/pairs: $(call after,$(shipped))
 	$(BIN)/python benchmarks/front_pairs.py > build/pairs.txt
 	$(table) build/pairs.txt --name front_pairs --command "python benchmarks/front_pairs.py"
 	$(finish)
 
 students = benchmarks/training_runs.py runs/ManeuveringTarget/student-? --against bptt --against semi-markov-9 --against semi-markov-15
 
-$(DONE)/students: $(DONE)/train-ManeuveringTarget-student $(DONE)/ship-ManeuveringTarget
+$(DONE)/students: $(call after,$(DONE)/train-ManeuveringTarget-student $(DONE)/ship-ManeuveringTarget)
 	$(BIN)/python $(students) > build/students.txt
 	$(table) build/students.txt --name students --command "python $(students)"
 	$(finish)
@@ -170,18 +184,18 @@ $(DONE)/students: $(DONE)/train-ManeuveringTarget-student $(DONE)/ship-Maneuveri
 strongest = benchmarks/training_runs.py runs/*/bptt-strongest-? \
   --against semi-markov --against level-bank --against exact-bayes --against fault-bank --against fault-hypotheses
 
-$(DONE)/strongest: $(shipped)
+$(DONE)/strongest: $(call after,$(shipped))
 	$(BIN)/python $(strongest) > build/strongest.txt
 	$(table) build/strongest.txt --name strongest --command "python $(strongest)"
 	$(finish)
 
-$(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation
+$(DONE)/drive: $(call after,$(DONE)/ship-LooselyCoupledNavigation)
 	$(BIN)/python benchmarks/drive_filters.py docs/data/drive.nc > build/drive.txt
 	$(table) build/drive.txt --name drive_filters \
 	  --command "python benchmarks/drive_filters.py docs/data/drive.nc"
 	$(finish)
 
-$(DONE)/online: $(DONE)/ship-ManeuveringTarget
+$(DONE)/online: $(call after,$(DONE)/ship-ManeuveringTarget)
 	$(BIN)/python benchmarks/online.py > build/online.txt
 	$(table) build/online.txt --name online_time --command "python benchmarks/online.py"
 	$(finish)

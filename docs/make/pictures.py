@@ -23,14 +23,11 @@ def draw_learning_curves(
     *,
     columns: int = 2,
 ) -> Any:
-    """Draw the cost of validations against the paper's algorithm over training: of each algorithm the median over its
-    runs, and a band from the lowest to the highest.
+    """Draw the cost of validations against the paper's algorithm over training, for each algorithm.
 
-    Args:
-        curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
-        title: title of the figure.
-        paper: name of the paper's algorithm, whose line is at zero.
-        columns: width of the figure in columns of a paper.
+    The line is the median over its runs, the band reaches from the lowest to the highest.
+
+    ``curves`` has for each algorithm and run the environment steps and the relative cost differences there.
     """
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
     axis = axes[0]
@@ -65,11 +62,7 @@ def draw_profiles(
 ) -> Any:
     """Draw the share of training runs with a score above each limit, with pointwise 95 % bands.
 
-    Args:
-        limits: limits of the score, ``(limits,)``.
-        profiles: algorithm -> share, lower and upper end of its interval, ``(3, limits)``.
-        title: title of the figure.
-        columns: width of the figure in columns of a paper.
+    ``profiles`` has for each algorithm share, lower and upper end, ``(3, limits)``.
     """
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.0}[columns])
     axis = axes[0]
@@ -97,16 +90,10 @@ def draw_differences(
     *,
     columns: int = 2,
 ) -> Any:
-    """Draw dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+    """Draw the cost of policies against the paper's algorithm in each scenario, as dots with intervals.
 
-    Args:
-        differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
-        names: policies in the order of the legend.
-        learned: policies drawn as diamonds.
-        unranked: references, drawn as grey squares.
-        title: title of the figure.
-        paper: name of the paper's algorithm, whose line is at zero.
-        columns: width of the figure in columns of a paper.
+    ``differences`` has for each scenario and policy the difference in percent, lower and upper end; diamonds
+    are ``learned``, grey squares ``unranked``.
     """
     height = 0.8 + len(differences) * (0.25 + 0.07 * len(names))
     figure, axes = figure_with_axes(columns=columns, height=height)
@@ -163,13 +150,9 @@ LEARNED = "kalman-net", "KalmanNet"
 def draw_public_problems(
     rows: Sequence[Mapping[str, Any]], drives: Mapping[str, Sequence[float]], *, columns: int = 2
 ) -> Any:
-    """Draw dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's
-    drives.
+    """Draw the errors of filters on KalmanNet's problems, as dots with intervals, and on each of NCLT's drives.
 
-    Args:
-        rows: rows of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
-        drives: filter -> RMSE a coordinate of every test drive, m.
-        columns: width of the figure in columns of a paper.
+    ``drives`` has the RMSE a coordinate of every test drive, m, of each filter.
     """
     [exact] = [row for row in rows if row["problem"] == "linear, exact"]
     panels = list(dict.fromkeys(row["problem"] for row in rows if row is not exact))
@@ -202,11 +185,9 @@ def draw_public_problems(
 
 @in_print
 def draw_update_times(rows: Sequence[Sequence[str]], *, columns: int = 2) -> Any:
-    """Draw bars of the time of an update, the quickest first; those of other libraries are grey.
+    """Draw bars of the time of an update, the quickest first; other libraries are grey.
 
-    Args:
-        rows: rows of the record: the filter, in quotes where it is ours, and the median time in microseconds.
-        columns: width of the figure in columns of a paper.
+    A row has the filter, in quotes where it is ours, and the median time, µs.
     """
     shown = sorted(rows, key=lambda row: float(row[1]))
     median = [float(row[1]) for row in shown]

@@ -80,11 +80,7 @@ def has_compiler() -> bool:
 
 
 def compile_filter(name: str) -> bytes:
-    """Export a filter as C, compile it to WebAssembly, and return the module's bytes.
-
-    Raises:
-        subprocess.CalledProcessError: if the compiler fails.
-    """
+    """Export a filter as C, compile it to WebAssembly, and return the module's bytes."""
     stem = file_stem(name)
     sums = [
         f"    weights[{i}] = sum((const double *)&state.{member} + {first}, {count});"
@@ -101,7 +97,7 @@ def compile_filter(name: str) -> bytes:
 
 
 def page_script(modules: dict[str, bytes]) -> str:
-    """Return the JavaScript text with the filters' names, weights, and WebAssembly modules in base64."""
+    """Return JavaScript text with the playground's filters: names, weights, WebAssembly modules in base64."""
     filters = {
         name: {"weights": list(FILTERS[name]), "module": base64.b64encode(module).decode("ascii")}
         for name, module in modules.items()

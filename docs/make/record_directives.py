@@ -47,7 +47,7 @@ def _words(text: str) -> list[str]:
 
 
 class _Rendered(SphinxDirective):
-    """Base of directives that render the Markdown of :meth:`markdown` and the picture of :meth:`figure`."""
+    """Base of directives that render the text of :meth:`markdown` and the picture of :meth:`figure`."""
 
     required_arguments = 0
     optional_arguments = 1
@@ -55,11 +55,9 @@ class _Rendered(SphinxDirective):
 
     @property
     def argument_text(self) -> str:
-        """Argument of the directive; empty without one."""
         return self.arguments[0].strip() if self.arguments else ""
 
     def markdown(self) -> str:
-        """Return the directive's text in Markdown; empty by default."""
         return ""
 
     def figure(self) -> tuple[str, str, Any] | None:
@@ -67,7 +65,7 @@ class _Rendered(SphinxDirective):
         return None
 
     def run(self) -> list[nodes.Node]:
-        """Return the rendered nodes; report a mistake at its place on the page."""
+        """Return the rendered nodes; a ValueError becomes a warning at the directive's line."""
         try:
             text, drawn = self.markdown(), self.figure()
         except ValueError as error:
@@ -83,7 +81,7 @@ class _Rendered(SphinxDirective):
     with_headings: ClassVar[bool] = False
 
     def benchmark(self, name: str) -> tuple[BenchmarkRecords, ResultRecord]:
-        """Return the record of a benchmark, and register it as a dependency of the page."""
+        """Return a benchmark's record by the environment's name, and register it as a dependency of the page."""
         self.env.note_dependency(record_file(f"{BENCHMARK}/{name}"))
         return read_benchmark(name)
 
@@ -110,7 +108,7 @@ class ResultsTable(_Rendered):
     }
 
     def markdown(self) -> str:
-        """Return the directive's table in Markdown."""
+        """Return the table of results in Markdown."""
         names = self.argument_text.split() or recorded_environments()
         scenario = self.options.get("scenario", "")
         policies, columns = (
@@ -125,13 +123,13 @@ class ComparisonTables(_Rendered):
     """``{comparison} ENVIRONMENT``: every scenario, in sentences, tables and a figure."""
 
     def markdown(self) -> str:
-        """Return sentences and tables in Markdown."""
+        """Return sentences and tables of the comparison in Markdown."""
         measured, record = self.benchmark(self.argument_text)
         self.compared = comparison.compare_environment(measured)
         return comparison.comparison_markdown(self.compared, measured, record)
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the figure of cost in every scenario, with name and alternative text."""
+        """Return file name, alternative text and figure of the cost in every scenario."""
         words = f"Cost against the paper's algorithm in every scenario, {self.argument_text}"
         return f"comparison_{self.argument_text}", words, self.compared.figure
 
@@ -140,7 +138,7 @@ class ComparisonOverview(_Rendered):
     """``{comparison-overview} best`` or ``harm``: over all environments."""
 
     def markdown(self) -> str:
-        """Return the directive's table in Markdown."""
+        """Return the overview table in Markdown."""
         found = [self.benchmark(name)[0] for name in recorded_environments()]
         return comparison.overview_markdown(found, self.argument_text)
 
@@ -149,7 +147,7 @@ class FrontFigure(_Rendered):
     """``{front-figure} ENVIRONMENT ...``: accuracy against time; default: all environments."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the figure of the fronts, with name and alternative text."""
+        """Return file name, alternative text and figure of the cost-time fronts."""
         names = self.argument_text.split() or recorded_environments()
         panels = panels_of([self.benchmark(name)[0] for name in names])
         if not panels:
@@ -162,7 +160,7 @@ class PublicFigure(_Rendered):
     """``{public-figure}``: KalmanNet's problems, with rivals that are tuned."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the figure of all problems, with name and alternative text."""
+        """Return file name, alternative text and figure of the errors on all problems."""
         figures = {name: self.record(f"public_{name}").data for name in ("problems", "optimised", "drives")}
         rows = [row for name in ("problems", "optimised") for row in figures[name]["figures"]["rows"]]
         drives = {
@@ -180,7 +178,7 @@ class UpdateTimes(_Rendered):
     """``{update-times}``: the time of an update of running filters, beside those of other libraries."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the figure of bars, with name and alternative text."""
+        """Return file name, alternative text and figure of the bars of update times."""
         rows = self.record("online_time").data["rows"]
         return "update_times", "Bars: median time of an update of each filter", draw_update_times(rows)
 
@@ -189,15 +187,15 @@ class BudgetsTable(_Rendered):
     """``{budgets-table}``: the lowest error cost within a time, of classical and learned competitors, everywhere."""
 
     def markdown(self) -> str:
-        """Return the directive's table in Markdown."""
+        """Return the table of lowest costs within each time in Markdown."""
         return budgets_markdown([self.benchmark(name)[0] for name in recorded_environments()])
 
 
 class SeedsTables(_Rendered):
-    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, all means."""
+    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, means of all."""
 
     def markdown(self) -> str:
-        """Return the tables in Markdown."""
+        """Return the tables of training seeds in Markdown."""
         if not self.argument_text:
             return seeds_overview([self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)])
         environment_id(self.argument_text)
@@ -208,13 +206,13 @@ class SeedProfiles(_Rendered):
     """``{seed-profiles} ALGORITHM ...``: interquartile means and performance profiles; default: all algorithms."""
 
     def markdown(self) -> str:
-        """Return the directive's table in Markdown."""
+        """Return the table of interquartile means in Markdown."""
         records = [self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)]
         self.scores = recorded_scores(records, self.argument_text.split())
         return interquartile_table(self.scores)
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the figure of the profiles, with name and alternative text."""
+        """Return file name, alternative text and figure of the performance profiles."""
         words = f"Share of training runs above each score: {', '.join(self.scores)}"
         return "_".join(["profiles", *self.scores]), words, profile_figure(self.scores)
 
@@ -230,14 +228,14 @@ class TrainingCurves(_Rendered):
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
-        """Return a sentence on the runs without a curve; empty without such runs."""
+        """Return a sentence on the algorithms whose curves the record lacks; empty if it has them all."""
         shown = {run[1] for run in self.data["runs"]}
         every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.argument_text}").data["runs"])
         missing = ", ".join(f"`{name}`" for name in every if name not in shown)
         return f"Curves of {missing} were not kept." if missing else ""
 
     def figure(self) -> tuple[str, str, Any] | None:
-        """Return the figure of the record's curves, with name and alternative text; None without curves."""
+        """Return file name, alternative text and figure of the training curves; None without curves."""
         if not self.data["runs"]:
             return None
         words = f"Validation cost over training, median and range over training seeds, {self.argument_text}"
@@ -250,7 +248,7 @@ class RecordTable(_Rendered):
     option_spec: ClassVar[Any] = {"columns": directives.unchanged, "bare": directives.flag}
 
     def markdown(self) -> str:
-        """Return the table in Markdown, with a sentence on its origin unless the option ``bare`` is set."""
+        """Return the record's table in Markdown, with a sentence on its origin unless the option ``bare`` is set."""
         record = self.record(self.argument_text)
         titles, rows = record.data["columns"], record.data["rows"]
         if "columns" in self.options:
@@ -261,14 +259,12 @@ class RecordTable(_Rendered):
 
 
 class EnvironmentTable(_Rendered):
-    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, from the code; and
-    ``{environment-table} causes``, of all environments.
-    """
+    """``{environment-table} NAME``: a table from the code, such as actions, of an environment; or ``causes`` of all."""
 
     option_spec: ClassVar[Any] = {"environment": directives.unchanged_required}
 
     def markdown(self) -> str:
-        """Return the table in Markdown."""
+        """Return the named table of an environment, or that of causes, in Markdown."""
         if self.argument_text == "causes":
             return causes_table()
         if "environment" not in self.options:
@@ -293,7 +289,7 @@ class NumberRole(SphinxRole):
         self.interval = interval
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """Return the node of a number, or of an error message."""
+        """Return the text node of a record's number, or that of an error."""
         return _in_sentence(
             self, lambda: [nodes.Text(number_text(self.text, self.interval))], record_of(self.text)
         )
@@ -323,7 +319,7 @@ class Playground(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return a node with the playground's element, scripts and colours."""
+        """Return the nodes of the playground: its element, scripts, and a picture where scripts are off."""
         page = Path(self.env.doc2path(self.env.docname)).parent
         static = os.path.relpath(Path(self.env.srcdir) / "_static", page)
         picture = nodes.image(uri=self.arguments[0], alt="Tracks of four filters, their errors and weights")

@@ -44,7 +44,7 @@ DIGITS = 6
 
 
 class ResultRecord(NamedTuple):
-    """Content of a record's file."""
+    """Content of a record's file: its data, and how they were made."""
 
     command: str
     """Command that makes the data again."""
@@ -64,7 +64,7 @@ class ResultRecord(NamedTuple):
 
 
 class BenchmarkRecords(NamedTuple):
-    """Results of a benchmark in one environment."""
+    """Results of a benchmark in one environment: the problem and tidy records."""
 
     problem: Problem
     records: list[Record]
@@ -76,11 +76,7 @@ class BenchmarkRecords(NamedTuple):
 
 
 def environment_id(name: str) -> str:
-    """Return the Gymnasium id of an environment with a short name, such as ``ManeuveringTarget``.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Return the Gymnasium id of an environment with a short name, such as ``ManeuveringTarget``."""
     known = {bare_name(id): id for id in catalogue()}
     if name not in known:
         raise nearest("environment", name, known)
@@ -107,11 +103,7 @@ def write_record(name: str, record: ResultRecord, folder: Path = FOLDER) -> Path
 
 
 def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
-    """Return a record, read from its file.
-
-    Raises:
-        ValueError: if there is none of that name, or the file has other content.
-    """
+    """Return a record, read from its file."""
     path = record_file(name, folder)
     if not path.is_file():
         raise ValueError(f"no record {name!r}: {path} does not exist")
@@ -127,7 +119,7 @@ def strip_folders(command: str) -> str:
 
 
 def today() -> str:
-    """Return today's date, ISO 8601."""
+    """Return today's date, UTC, as ISO 8601 text."""
     return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
 
 
@@ -137,7 +129,7 @@ def round_number(value: float | None) -> float | None:
 
 
 def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
-    """Return a value as JSON text, with a line for each flat or deeply nested entry."""
+    """Return a value as JSON text, a line for each entry that is flat or nested deeply."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
         return json.dumps(value, ensure_ascii=False)
@@ -190,8 +182,7 @@ def merge_competitors(
 
     Args:
         data: data of the whole benchmark.
-        added: data of the same environment with some competitors, among them the best of each scenario, since all
-            others are compared with it.
+        added: data of the same environment with some competitors, among them the best of each scenario.
         names: names of the added or replaced competitors; the others serve the comparison.
 
     Raises:
@@ -226,7 +217,7 @@ def _same_cost(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _best(scenario: Mapping[str, Any]) -> str:
-    """Return the name of the competitor with which the others are compared."""
+    """Return the name of the competitor of lowest cost, with which the others are compared."""
     [name] = {
         key.partition(" ")[2]
         for each in scenario["competitors"].values()

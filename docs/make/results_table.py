@@ -28,15 +28,9 @@ COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anee
 def scenario_records(
     benchmark: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
-    """Return the records of a benchmark in one scenario, without random actions.
+    """Return a benchmark's records of one scenario; of all competitors but random actions by default.
 
-    Args:
-        benchmark: results in an environment.
-        scenario: name of the scenario; default: the training distribution.
-        policies: names of competitors. Default: all.
-
-    Raises:
-        ValueError: if there are no results.
+    Default scenario: the training distribution.
     """
     scenario = scenario or benchmark.problem.task.default_scenario
     records = [
@@ -57,13 +51,7 @@ def scenario_records(
 def results_grid(
     records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
 ) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the table of results in one environment and scenario, lowest cost first.
-
-    Args:
-        records: records of one scenario.
-        paper: name of the paper's algorithm.
-        columns: some of :data:`COLUMNS`.
-    """
+    """Return header and rows of the results in one environment and scenario, lowest cost first."""
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     times = column_of_times(records)
@@ -112,13 +100,9 @@ def chosen_markdown(
     policies: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> str:
-    """Return one table of results in Markdown over several environments, or with some competitors or columns.
+    """Return a Markdown table of results in several environments, or of some competitors or columns.
 
-    Args:
-        benchmarks: records of the environments by their short names.
-        scenario: name of the scenario; default: the training distribution of each.
-        policies: names of competitors. Default: all.
-        columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
+    Default columns: those whose titles are the same in every environment.
 
     Raises:
         ValueError: for an unknown column, one that several environments cannot share, and if there are no results.

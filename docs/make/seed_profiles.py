@@ -37,13 +37,11 @@ Scores = Mapping[str, Mapping[str, numpy.ndarray]]
 
 
 def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] = ()) -> Scores:
-    """Return the scores of all training runs, by algorithm and environment, where every algorithm has runs.
+    """Return scores of training runs by algorithm and environment, for environments in which all algorithms have runs.
 
     Agents are not distinguished by a gate or by a policy that they correct.
 
-    Args:
-        records: records of training seeds; the scores are those of their first scenario, the training distribution.
-        algorithms: names of algorithms; default: all.
+    The scores are those of the first scenario of a record, the training distribution.
 
     Raises:
         ValueError: if there is no such algorithm, or no environment that all of them have.
@@ -71,12 +69,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Return the weights of runs (1), then of each bootstrap resample, ``(1 + resamples, sum of counts)``.
-
-    Args:
-        counts: runs of each environment.
-        resamples: number of resamples of the bootstrap.
-    """
+    """Return the weights of runs (1), then those of each bootstrap resample, ``(1 + resamples, runs)``."""
     each = [Bootstrap(count, resamples, seed).weights for seed, count in enumerate(counts)]
     return numpy.concatenate(each, axis=1) / len(counts)
 
@@ -84,9 +77,7 @@ def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndar
 def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.ndarray:
     """Return the interquartile mean (2) of scores under each row of weights, ``(n,)``.
 
-    Args:
-        scores: ``(runs,)``.
-        weights: weights that sum to one, ``(n, runs)``.
+    The weights ``(n, runs)`` sum to one in a row.
     """
     order = numpy.argsort(scores)
     ends = numpy.cumsum(weights[:, order], axis=1)
@@ -117,7 +108,7 @@ def interquartile_table(scores: Scores) -> str:
 
 
 def profile_figure(scores: Scores) -> Any:
-    """Return a figure with the performance profile of every algorithm."""
+    """Return a figure with each algorithm's performance profile: share of runs above each score."""
     everything = numpy.concatenate([_pooled(own) for own in scores.values()])
     limits = numpy.linspace(min(0.0, everything.min()), max(1.0, everything.max()), 401)
     profiles = {}

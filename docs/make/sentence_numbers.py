@@ -2,8 +2,8 @@
 
 ``ManeuveringTarget/random/bptt/difference`` is of a benchmark: environment, scenario, competitor, quantity.
 ``seeds/ManeuveringTarget/random/bptt/mean`` is of training seeds: the cost against the paper's algorithm of an
-algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent (no statistic). Every other
-path is record, row and column of a table of text, see :func:`.records.table_cell`.
+algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent. Every other path is record,
+row and column of a table of text, see :func:`.records.table_cell`.
 """
 
 from pathlib import Path
@@ -46,11 +46,6 @@ def record_of(path: str) -> str:
 
 def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:
     """Return the number of a path as text for a sentence: ``-43.6 % [-45.0, -42.1]``.
-
-    Args:
-        path: path of the number.
-        interval: whether to add the interval, where there is one.
-        folder: folder of the records.
 
     Raises:
         ValueError: if the path leads nowhere.

@@ -40,7 +40,7 @@ from filtergym.reports.tables.terminal_tables import select_components, with_int
 
 
 class Comparison(NamedTuple):
-    """One number of a run, of an algorithm's runs together, or of an opponent."""
+    """One number with interval: of a run, of an algorithm's runs together, or of an opponent."""
 
     environment: str
     scenario: str
@@ -62,7 +62,7 @@ class Comparison(NamedTuple):
 
 
 class SeedRun(NamedTuple):
-    """One training run among those of its algorithm."""
+    """One training run among those of its algorithm: record, agent and folder."""
 
     algorithm: str
     """Name of the algorithm, with the control where its runs have several."""
@@ -78,7 +78,7 @@ class SeedRun(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """Description of one training run on pages."""
+    """Description of a training run on pages: name, algorithm, seed, steps and command."""
 
     name: str
     algorithm: str
@@ -90,7 +90,7 @@ class Trained(NamedTuple):
 
 
 class EpisodeMeans(NamedTuple):
-    """All policies' mean costs and squared errors of every episode in one scenario."""
+    """Mean cost and squared errors of every episode in one scenario, of each policy by name."""
 
     cost: dict[str, numpy.ndarray]
     """Mean cost of every episode, ``(episodes,)``, by policy."""
@@ -100,7 +100,7 @@ class EpisodeMeans(NamedTuple):
 
 
 class PolicyMeans(NamedTuple):
-    """One policy's mean cost and squared errors of every episode."""
+    """Mean cost and squared errors of every episode, of one policy."""
 
     cost: numpy.ndarray
     """Mean cost of every episode, ``(episodes,)``."""
@@ -110,7 +110,7 @@ class PolicyMeans(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Mean over seeds and episodes, and its sources of variation."""
+    """Mean over seeds and episodes, and its standard deviations between seeds and over episodes."""
 
     mean: IntervalEstimate
     between_seeds: float
@@ -122,9 +122,8 @@ class Spread(NamedTuple):
 def spread(values: numpy.ndarray) -> Spread:
     """Return the mean with interval, and its variation over training seeds and over episodes (random effects).
 
-    The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds
-    and new episodes: Student's t with Satterthwaite's degrees of freedom. A bootstrap over five seeds would
-    give too narrow an interval.
+    The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds and new
+    episodes: Student's t with Satterthwaite's degrees of freedom; a bootstrap over five seeds would be too narrow.
 
     Args:
         values: a number for each seed and episode, ``(seeds, episodes)``.
@@ -153,10 +152,6 @@ def spread(values: numpy.ndarray) -> Spread:
 
 def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
     """Return the training runs in some folders, all of one environment, sorted by algorithm and seed.
-
-    Args:
-        folders: folders of the runs.
-        trust: whether to import the modules that their records name; see :func:`.load_run`.
 
     Raises:
         ValueError: if they are of different environments, or runs of one algorithm differ in more than the
@@ -195,7 +190,7 @@ def _algorithm(run: TrainingRun) -> str:
 
 
 def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
-    """Return environment steps and relative cost differences of a run's validations; None without any."""
+    """Return the steps and relative cost differences of a run's validations; None if any has no difference."""
     entries = run.validation
     relative = [entry.get("relative_cost_difference") for entry in entries]
     differences = [float(f"{difference[0]:.4g}") for difference in relative if difference]
@@ -206,10 +201,6 @@ def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
 
 def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
     """Return a figure of the validation cost of every algorithm over training.
-
-    Args:
-        data: data of a record of training seeds, or from :func:`runs_data`.
-        columns: width of the picture in columns of a paper.
 
     Raises:
         ValueError: if a run has no validations.
@@ -225,7 +216,7 @@ def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
 
 
 def default_opponents(problem: Problem) -> list[str]:
-    """Return the names of the default opponents of runs: paper's algorithm, strong policies, reference."""
+    """Return the default opponents of runs, by name: paper's algorithm, tunable and tuned policies, references."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
     names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
@@ -233,7 +224,7 @@ def default_opponents(problem: Problem) -> list[str]:
 
 
 class Study(NamedTuple):
-    """A comparison of runs with opponents, over the same episodes of every scenario."""
+    """A comparison of runs with opponents, over the same episodes of each scenario."""
 
     runs: Sequence[SeedRun]
     opponents: Sequence[str]
@@ -258,13 +249,6 @@ def episode_means(
     workers: Workers | None = None,
 ) -> EpisodeMeans:
     """Evaluate runs and opponents on the same episodes of a scenario, and return their means over each episode.
-
-    Args:
-        study: runs, opponents and episodes.
-        scenario: name of the scenario.
-        progress: function that is called with the number of measurements done.
-        store: storage of the means of each. Default: none.
-        workers: processes that share the work.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
@@ -299,7 +283,7 @@ def episode_means(
 
 
 def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
-    """Return for each run and opponent, by name, the evaluation request, and the work item of its means or None."""
+    """Return for each run and opponent, by name, the evaluation request, and the key of its stored means."""
     problem = study.problem
     entered = {m.name: find_competitor(problem, str(m.agent), study.trust) for m in study.runs}
     for name in dict.fromkeys([problem.paper, *study.opponents]):
@@ -327,7 +311,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
 
 @functools.cache
 def _own_digest() -> str:
-    """Return a SHA-256 digest of the code in this folder, part of the keys of stored means."""
+    """Return a SHA-256 digest of the code in this folder, a part of the keys of stored means."""
     return files_digest([Path(__file__).parent])
 
 
@@ -339,7 +323,7 @@ def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMe
 
 
 def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
-    """Yield the statistics of an evaluation: mean cost of every episode, and mean square of every component."""
+    """Yield the statistics of an evaluation: mean cost and mean squared errors of every episode."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
     for component in select_components(list(components_and_groups(run))):
@@ -350,8 +334,8 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
 def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison]:
     """Return every number of the tables of one scenario, with interval, from the episodes' means.
 
-    Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
-    the mean's interval is over training seeds as well (:func:`spread`).
+    Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; that of the mean
+    is over training seeds as well (:func:`spread`).
     """
     runs, problem = study.runs, study.problem
     paper, reference = problem.paper, problem.baselines.score_reference
@@ -372,7 +356,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         values: Any,
         component: str = "",
     ) -> None:
-        """Append a comparison: an estimate, or an interval from a statistic and its bootstrap resamples."""
+        """Append a comparison whose estimate is given, or computed from a statistic and its bootstrap resamples."""
         estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)
@@ -517,7 +501,7 @@ def compare_scenarios(
 
 
 def describe_runs(runs: Sequence[SeedRun]) -> list[Trained]:
-    """Return a description of each training run, for pages."""
+    """Return the descriptions of training runs on pages."""
     return [
         Trained(
             member.name,
@@ -559,29 +543,43 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
     }
 
 
-def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's data with algorithms added or replaced that were scored later over the same episodes.
+def opponents_of_record(data: Mapping[str, Any]) -> list[str]:
+    """Return the opponents in a record's data, for further runs that are compared with the same ones.
 
     Raises:
-        ValueError: if environment, episodes or scenarios differ.
+        ValueError: if one is no longer a competitor of the environment.
     """
-    for key in ("environment", "split", "seed", "episodes"):
-        if data[key] != added[key]:
-            raise ValueError(f"the record has {key} {data[key]}, what is added {added[key]}")
-    if list(data["scenarios"]) != list(added["scenarios"]):
-        raise ValueError(f"the record is of {', '.join(data['scenarios'])}")
+    problem = problem_of(data["environment"])
+    names = [row[0] for rows in data["scenarios"].values() for row in rows if row[1] == "opponent"]
+    if gone := [name for name in names if problem.find(name) is None]:
+        raise ValueError(
+            f"the record has the opponent {gone[0]!r}, which {problem.id} no longer has: make it anew from all runs, "
+            f"by python docs/make seeds runs/{bare_name(problem.id)}/*-? --scenario {next(iter(data['scenarios']))} "
+            f"--episodes {data['episodes']} --into docs/records"
+        )
+    return list(dict.fromkeys(names))
+
+
+def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's data with algorithms added or replaced that were scored later over the same episodes, against
+    the same opponents; of the added errors those of the record's components.
+
+    Raises:
+        ValueError: if the environment differs.
+    """
+    if data["environment"] != added["environment"]:
+        raise ValueError(f"the record is of {data['environment']}, the runs are of {added['environment']}")
     fresh = {algorithm for _, algorithm, *_ in added["runs"]}
     kept = [run for run in data["runs"] if run[1] not in fresh]
     gone = {run[0] for run in data["runs"]} - {run[0] for run in kept}
     scenarios = {}
     for name, rows in data["scenarios"].items():
-        new = added["scenarios"][name]
+        new = [row for row in added["scenarios"][name] if row[4] in ("", *data["units"])]
         measured = {row[0] for row in new} | fresh | gone
         scenarios[name] = [row for row in rows if row[0] not in measured] + new
     curves = {name: curve for name, curve in data.get("curves", {}).items() if name not in gone}
     return {
         **data,
-        "units": {**data["units"], **added["units"]},
         "runs": sorted([*kept, *added["runs"]], key=lambda run: (run[1], run[2])),
         "curves": {**curves, **added["curves"]},
         "scenarios": scenarios,
@@ -601,10 +599,10 @@ def seeds_markdown(record: ResultRecord) -> str:
 
 
 def seeds_overview(records: Sequence[ResultRecord]) -> str:
-    """Return a table in Markdown: mean cost over training seeds of every algorithm in every environment.
+    """Return a Markdown table: cost of every algorithm against the paper's, mean over training seeds, by environment.
 
-    Beside them stands the opponent of the lowest cost that is no reference. Agents are not distinguished by a gate or
-    by a policy that they correct.
+    Beside them stands the opponent of lowest cost that is no reference. Agents are not distinguished by a gate or by a
+    policy that they correct.
     """
     means: dict[str, dict[str, str]] = {}
     for record in records:

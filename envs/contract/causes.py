@@ -1,8 +1,8 @@
 """Causes of an estimate's cost: circumstances of a measurement that an author declares, such as a turn.
 
-A cause is true or false at each measurement, and several may be true at once. Each is computed from a :class:`Moment`
-and is traced with the steps of the task. A cause that cannot be computed, such as that of a context which a recording
-does not contain, is false everywhere, and an evaluation omits it.
+Several causes may be true at a measurement. Each is computed from a :class:`Moment`, and traced with the steps of the
+task. A cause that cannot be computed, such as of a context that a recording does not contain, is false everywhere; an
+evaluation omits it.
 """
 
 import itertools
@@ -42,7 +42,7 @@ class Moment(NamedTuple):
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
     def has_context(self, *names: str) -> bool:
-        """Return whether the context has an array under each of these names and none of these arrays is empty."""
+        """Return whether the context has a non-empty array under each of these names."""
         return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
 
@@ -90,11 +90,7 @@ def _is_between(
 
 
 def context_flag(name: str) -> Callable[[Moment], Array | None]:
-    """Return a function from a :class:`Moment` to booleans ``(N,)``: whether a number of the context is above zero.
-
-    Args:
-        name: name of that number, ``(N,)``.
-    """
+    """Return a function from a :class:`Moment` to booleans ``(N,)``: whether this number of the context is positive."""
 
     def holds(moment: Moment) -> Array | None:
         return moment.context[name] > 0.0 if moment.has_context(name) else None
@@ -103,7 +99,7 @@ def context_flag(name: str) -> Callable[[Moment], Array | None]:
 
 
 def _is_missed(moment: Moment) -> Array | None:
-    """Return booleans ``(N,)``: whether any part of the measurement is unavailable; None if it has no availability."""
+    """Return booleans ``(N,)``: whether any part of the measurement is missing; None if parts cannot be missing."""
     available = getattr(moment.measurement, "available", None)
     if available is None:
         return None
@@ -114,7 +110,7 @@ def _is_missed(moment: Moment) -> Array | None:
 
 
 def _is_outlier(moment: Moment) -> Array | None:
-    """Return booleans ``(N,)``: whether the error of a reading exceeds ``LARGE_ERROR`` stated standard deviations."""
+    """Return booleans ``(N,)``: whether a reading's error exceeds ``LARGE_ERROR`` stated standard deviations."""
     if moment.readings is None or moment.deviations is None:
         return None
     error = moment.xp.abs(moment.readings - moment.state)
@@ -127,7 +123,7 @@ OUTLIER = Cause("outlier", f"on outliers beyond {LARGE_ERROR:g} stated sigma", _
 
 
 class Causes(NamedTuple):
-    """The causes by which an evaluation splits the costs of estimates."""
+    """Companion of a problem: the causes by which an evaluation splits the costs of estimates."""
 
     causes: tuple[Cause, ...] = (MISSED,)
     start: int = 10
@@ -140,12 +136,7 @@ class Causes(NamedTuple):
 
 
 def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
-    """Encode the causes that are true at a moment as one number ``(N,)``: the sum of ``2 ** index`` over them.
-
-    Args:
-        causes: of the task, at most ``MOST_CAUSES``.
-        moment: at a measurement.
-    """
+    """Encode the causes that are true at a moment as one number ``(N,)``: the sum of ``2 ** index`` over them."""
     xp, total = moment.xp, 0.0 * moment.state[0]
     total = xp.where(total == total, total, 0.0)  # the truth of a recording may be NaN
     for place, cause in enumerate(causes):

@@ -1,8 +1,7 @@
 """Companions of a problem: optional objects beside its declaration, found by their types.
 
-:attr:`.Task.companions` names them. The contract needs none of them: each user of a companion finds it with
-:func:`find_companion`. Further ones stand where their subject does: :class:`~.causes.Causes`,
-:class:`~.live_input.LiveReader`, :class:`~.log_format.LogFormat`.
+:attr:`.Task.companions` lists them, and their users find them with :func:`find_companion`. Further ones are
+:class:`~.causes.Causes`, :class:`~.live_input.LiveReader`, :class:`~.log_format.LogFormat`.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,17 +13,12 @@ Companion = TypeVar("Companion")
 
 
 def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
-    """Return the first companion object of a task that is an instance of a type; None without one.
-
-    Args:
-        task: a task, or a class of tasks.
-        kind: the type.
-    """
+    """Return the first companion of a task, or of a class of tasks, that is of this type; None if there is none."""
     return next((one for one in task.companions if isinstance(one, kind)), None)
 
 
 class Paper(NamedTuple):
-    """Source paper of a problem."""
+    """Source paper of a problem: its citation."""
 
     source: str
     """Reference of the paper."""
@@ -62,7 +56,7 @@ class LostTracks(NamedTuple):
 
 
 class ArrayMeanings(NamedTuple):
-    """Meanings of arrays, in words for users of another program."""
+    """Descriptions of a task's measurement and feedback arrays, for users of another program."""
 
     measurement: str = ""
     """Meaning of the numbers of a measurement, in a sentence; empty where the names suffice."""
@@ -89,7 +83,7 @@ class FlightScenarios(NamedTuple):
 
 
 class LoopRecords(NamedTuple):
-    """Further records of each measurement, beside those of filter and world."""
+    """Values to record at each measurement beside those of filter and world."""
 
     report: Callable[[Any, Any, dict[str, Array]], dict[str, Array]]
     """Function of the model, the episode after the action, and the records of filter and world; it returns further
@@ -97,13 +91,13 @@ class LoopRecords(NamedTuple):
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:
-    """Return the classes of the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
+    """Return the classes of the learned estimators' banks of a task or class of tasks, by training algorithm."""
     found = find_companion(task, TrainedBanks)
     return {} if found is None else found.banks
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the names of the task parameters that set the range or duration of an action of a control.
+    """Return the names of the parameters that set the range or duration of an action of a control.
 
     The duration belongs to every control; the network of a trained bank acts at each measurement.
     """
@@ -119,11 +113,11 @@ def action_meanings(task: Any) -> Mapping[str, str]:
 
 
 def lost_cost(task: Any) -> float | None:
-    """Return the mean cost of an episode above which its track counts as lost; None where a task declares none."""
+    """Return the mean cost of an episode above which its track counts as lost; None where the task has no limit."""
     found = find_companion(task, LostTracks)
     return None if found is None else found.cost
 
 
 def array_meanings(task: Any) -> ArrayMeanings:
-    """Return the descriptions of a task's measurement and feedback arrays; empty texts where it declares none."""
+    """Return the descriptions of a task's measurement and feedback arrays; empty texts where it has none."""
     return find_companion(task, ArrayMeanings) or ArrayMeanings()

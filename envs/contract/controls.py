@@ -35,11 +35,11 @@ def bank_probabilities(
     evidence_scale: float,
     xp: ModuleType,
 ) -> Array:
-    """Return the weights ``(M, N)`` of the M hypotheses of a bank that follow from an action under a control.
+    """Return the weights ``(M, N)`` of a bank's M hypotheses that an action sets under a control.
 
     Args:
         control: "mode", "weights" or "evidence".
-        action: ``(N,)`` integers for mode, otherwise ``(M, N)``; limits of the space are enforced here.
+        action: ``(N,)`` integers for mode, otherwise ``(M, N)``; clipped to the limits of the space.
         log_predicted: logarithm of the predicted probabilities, ``(M, N)``.
         log_likelihood: of each hypothesis, ``(M, N)``.
         evidence_scale: nats that an evidence of one adds to the log-posterior.
@@ -58,7 +58,7 @@ def bank_probabilities(
 
 
 class SteerableFilter(Filter[TaskT, Measurement, State]):
-    """Filter with settings (noise levels, gains) that an action multiplies at each measurement.
+    """Base class of filters whose settings (noise levels, gains) an action multiplies at each measurement.
 
     The action of :meth:`update` is the logarithm of each factor, ``(n, N)``. Without an action the filter is an
     estimator.
@@ -69,23 +69,16 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
     explores, then increases the cost by a twentieth at most."""
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where an action affects the update with a measurement, zero where nothing was measured,
-        ``(N,)``.
-        """
+        """Return 1 where an action affects the update with a measurement, else 0, ``(N,)``; by default 1."""
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """Return the state after an update without an action, from which the observation is computed.
-
-        Args:
-            state: after :meth:`predict`.
-            measurement: the same.
-        """
+        """Return the result of an update with a measurement without an action, to compute the observation from."""
         return self.update(state, FilterInput(measurement))
 
 
 class SettingsBank(Bank[Any, Any, Any]):
-    """A bank of one filter whose settings the action multiplies.
+    """Base class of banks of one filter whose settings the action multiplies.
 
     The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where the filter declares r_k. The zero action is
     the filter itself, bit for bit: an agent starts from the strongest classical filter.
@@ -107,18 +100,12 @@ class SettingsBank(Bank[Any, Any, Any]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box [-1, 1] with one number for each setting."""
+        """Gymnasium box [-1, 1] with one number for each setting of the filter."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 
     @abstractmethod
     def add_observed(self, state: Any, result: Any, measurement: Any) -> Any:
-        """Return the bank's state with the values that the agent observes at a measurement filled in.
-
-        Args:
-            state: contains that of the filter after :meth:`predict`.
-            result: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
-            measurement: the current one.
-        """
+        """Return the bank's state with the values that the agent observes at a measurement filled in."""
 
     def predict(self, state: Any, measurement: Any) -> Any:
         """Return the bank's state predicted to a measurement, with the values that the agent observes."""
@@ -126,9 +113,7 @@ class SettingsBank(Bank[Any, Any, Any]):
         return self.add_observed(state._replace(own=own), self.own.examine(own, measurement), measurement)
 
     def act(self, state: Any, measurement: Any, action: Array) -> Any:
-        """Return the state updated with a measurement by the filter, its settings multiplied by the action's
-        factors.
-        """
+        """Return the state updated with a measurement, the filter's settings multiplied by the action's factors."""
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
         logarithms = self.own.has_effect(measurement) * self.log_reach * shown
         own = self.own.update(state.own, FilterInput(measurement, None, logarithms))

@@ -1,8 +1,8 @@
 """The random quantities of an episode: named draws from uniform random numbers.
 
 A world draws its quantities in a fixed order. A first pass without random numbers counts how many numbers that takes
-(:meth:`Draws.counting`). Each draw is stored by name: the levels, times and kinds of an episode are its context. A
-draw may apply within a window of time, or change in steps: :func:`is_within`, :class:`StepSignal`.
+(:meth:`Draws.counting`). Each draw is stored by name, for the context of the episode. It may apply within a window of
+time, or change in steps: :func:`is_within`, :class:`StepSignal`.
 """
 
 import math
@@ -14,7 +14,7 @@ from .observation import Array
 
 
 class Draws:
-    """Named random quantities, computed one after another from uniform numbers on [0, 1).
+    """Random quantities of episodes, drawn by name one after another from uniform numbers on [0, 1).
 
     Every method takes the name of the quantity and, with ``count``, draws ``(count, N)`` of it in place of
     ``(N,)``.
@@ -36,12 +36,7 @@ class Draws:
 
     @classmethod
     def counting(cls, average: Array, xp: ModuleType) -> "Draws":
-        """Return draws without random numbers, each uniform number one half, that count the numbers used in ``used``.
-
-        Args:
-            average: ``(1, N)``, all one half.
-            xp: array namespace.
-        """
+        """Return draws that only count the random numbers used, in ``used``; every number is one half."""
         draws = cls(average, xp)
         draws._average = average
         return draws
@@ -62,49 +57,43 @@ class Draws:
         return values
 
     def unit(self, name: str, count: int | None = None) -> Array:
-        """Draw values of a quantity, uniformly distributed on [0, 1), ``(N,)`` or ``(count, N)``."""
+        """Draw a quantity that is uniformly distributed on [0, 1), ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw values of a quantity, uniformly distributed between two limits, ``(N,)`` or ``(count, N)``."""
+        """Draw a quantity that is uniformly distributed between two limits, ``(N,)`` or ``(count, N)``."""
         low, high = limits
         return self._keep(name, low + (high - low) * self._rows(count))
 
     def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw values whose logarithm is uniformly distributed between two positive limits, ``(N,)`` or ``(count,
-        N)``.
-        """
+        """Draw a quantity with uniformly distributed logarithm between two limits, ``(N,)`` or ``(count, N)``."""
         low, high = limits
         return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
-        """Draw integers from the first to the last limit, all equally probable, as floats, ``(N,)`` or ``(count,
-        N)``.
-        """
+        """Draw equally probable integers from the first to the last limit, floats ``(N,)`` or ``(count, N)``."""
         first, last = limits
         return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
-        """Draw booleans that are true with a given probability, ``(N,)`` or ``(count, N)``."""
+        """Draw booleans that are true with a probability, ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
-        """Draw an integer index ``(N,)`` from cumulative probabilities, by the inverse of the distribution.
+        """Draw an integer index ``(N,)`` with the given cumulative probabilities.
 
-        Args:
-            name: name of the quantity.
-            thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
+        ``thresholds`` are the cumulative probabilities but the last, numbers or ``(N,)`` each.
         """
         return self._keep(name, category(self._rows(None), thresholds, self.xp))
 
 
 def draw_between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
-    """Draw between two limits; if they are equal, return that value without using a random number."""
+    """Draw a quantity between two limits; equal limits are returned without using a random number."""
     return limits[0] if limits[0] == limits[1] else draw(name, limits)
 
 
 def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Array:
-    """Return the integer index ``(N,)`` of the interval between thresholds in which a uniform number lies."""
+    """Return the integer index ``(N,)`` of the interval between thresholds that contains a uniform number."""
     index = xp.zeros_like(uniform, dtype=xp.int64)
     for threshold in thresholds:
         index = index + xp.astype(uniform >= threshold, xp.int64)
@@ -120,7 +109,7 @@ class StepSignal(NamedTuple):
     """Times of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
 
     def at(self, time: Array, xp: ModuleType) -> Array:
-        """Return the value of the piecewise constant signal at a time, ``(..., N)``."""
+        """Return the value of the signal at a time, ``(..., N)``."""
         value = self.values[0]
         for i in range(self.times.shape[0]):
             value = xp.where(time >= self.times[i], self.values[i + 1], value)
@@ -128,5 +117,5 @@ class StepSignal(NamedTuple):
 
 
 def is_within(time: Array, window: Array) -> Array:
-    """Return booleans ``(N,)``: whether a time lies in a window ``[start, end)``, its first and second row."""
+    """Return booleans ``(N,)``: whether a time lies in a window ``[start, end)``, the rows of ``window``."""
     return (time >= window[0]) & (time < window[1])

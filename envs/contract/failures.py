@@ -13,9 +13,9 @@ PYTHON = str(Path(traceback.__file__).parent)
 
 
 def user_code_line(error: BaseException) -> str:
-    """Return the last line of the user's code in a traceback, as " (mine.py, line 12)"; "" if there is none.
+    """Return the last line of the user's code in a traceback as text, " (mine.py, line 12)"; "" if there is none.
 
-    Code of this package and of installed libraries is not the user's own.
+    Code of this package and of installed libraries does not count.
     """
     found = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
@@ -29,10 +29,10 @@ def user_code_line(error: BaseException) -> str:
 
 @contextmanager
 def explain_errors(what: str) -> Iterator[None]:
-    """Context manager that re-raises errors of a user's code as a ValueError that names the line of that code.
+    """Context manager: turn errors in a user's code into a ValueError that names the line of that code.
 
     Args:
-        what: beginning of the sentence.
+        what: beginning of the message.
 
     Raises:
         ValueError: for any error but that of code that cannot be traced.

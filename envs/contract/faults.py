@@ -12,7 +12,7 @@ from .task_base import TaskBase
 
 
 class DisturbanceInput(NamedTuple):
-    """Input of a disturbance at one measurement: time and random numbers."""
+    """Input of a disturbance at one measurement, such as time and random numbers."""
 
     number: Array
     """Number of the measurement, from 1 on, ``(N,)``."""
@@ -27,13 +27,13 @@ class DisturbanceInput(NamedTuple):
 
 
 def draw_undisturbed(draws: Draws, parameters: Any) -> Array | None:
-    """Draw booleans ``(N,)``: which episodes have no hidden disturbance; None if every episode may have them.
+    """Draw which episodes have no hidden disturbance, booleans ``(N,)``; None if every episode may have one.
 
     The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
     same law as in all others, so that no report reveals whether an episode is one of them.
 
     Args:
-        draws: random numbers that fix the scenario of each episode.
+        draws: random quantities of each episode.
         parameters: of the task, with the probability ``undisturbed``.
     """
     if not parameters.undisturbed:
@@ -43,14 +43,11 @@ def draw_undisturbed(draws: Draws, parameters: Any) -> Array | None:
 
 
 class Disturbance(ABC):
-    """Base class of a disturbance of sensors, with a name, random draws, an effect and causes.
+    """Base class of a sensor disturbance, such as outliers or an outage: draws, effect, causes of cost.
 
-    It is drawn with the episode, advances with every measurement, and acts through the methods that it defines: on the
-    deviations of the white errors, on errors, on the reading, or on the whole measurement. Its state contains its draws
-    and its current values, nested NamedTuples of arrays ``(..., N)``. The default methods draw and change nothing.
-
-    Args:
-        task: with its parameters.
+    It is drawn with the episode, advances with every measurement, and acts through the methods that it overrides. Its
+    state contains draws and current values, nested NamedTuples of arrays ``(..., N)``. The default methods draw and
+    change nothing.
 
     Attributes:
         name: name of its state in the truth; a reference declares by it that it knows the disturbance.
@@ -72,83 +69,68 @@ class Disturbance(ABC):
 
     @classmethod
     def is_enabled(cls, parameters: Any) -> bool:
-        """Return whether a task with these parameters has the disturbance; by default True."""
+        """Return whether the parameters of a task switch the disturbance on; by default True."""
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
-        """Draw the random quantities of an episode and return the disturbance's state at the start of the track.
+        """Draw the disturbance of each episode; return its state at the start, by default None.
 
         Args:
-            draws: random numbers that fix the scenario of each episode.
+            draws: random quantities of each episode.
             normals: ``(initial_normals, N)``.
             zero: ``(N,)``.
         """
         return None
 
-    def complete(self, state: Any, draws: Draws) -> Any:
-        """Return the state of :meth:`begin` with the quantities added that only some scenarios draw.
+    def draw_further(self, state: Any, draws: Draws) -> Any:
+        """Return the state of :meth:`begin` with draws added that only some scenarios have; by default none.
 
         They come after the draws of all scenarios, so that the other scenarios use the same numbers as without them.
         """
         return state
 
     def switch_off(self, state: Any, undisturbed: Array) -> Any:
-        """Return the initial state with the disturbance switched off in episodes without hidden disturbances.
+        """Return the state with the disturbance switched off in episodes without hidden ones; by default unchanged.
 
-        A disturbance that the measurement reports leaves its state as it is, see :func:`draw_undisturbed`.
-
-        Args:
-            state: at the start of the track.
-            undisturbed: whether an episode has no hidden disturbance, booleans ``(N,)``.
+        A disturbance that the measurement reports leaves it unchanged, see :func:`draw_undisturbed`.
         """
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """Return the disturbance's state at the next measurement."""
+        """Return the disturbance's state at the next measurement, by default unchanged."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Return the standard deviations of the white errors relative to nominal, ``(..., N)``, as the disturbance
-        changes them.
-        """
+        """Return the white errors' relative deviations, ``(..., N)``, as disturbed; by default unchanged."""
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Return the sensor errors, ``(n, N)``, in the world's units, as the disturbance changes them."""
+        """Return the sensor errors, ``(n, N)`` in the world's units, as disturbed; by default unchanged."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """Return the state and the sensor reading, ``(n, N)`` in the sensor's coordinates, as the disturbance changes
-        it.
-        """
+        """Return the state, and the sensor reading ``(n, N)`` as disturbed; by default unchanged."""
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """Return the state and the whole measurement as the disturbance changes it.
-
-        Args:
-            state: of :meth:`advance`.
-            measurement: the world's NamedTuple, with the missed values.
-            step: the argument of :meth:`advance`.
-        """
+        """Return the state, and the whole measurement as disturbed; by default unchanged."""
         return state, measurement
 
     def context(self, state: Any) -> dict[str, Array]:
-        """Return the random draws of the disturbance by name, for the context of an episode."""
+        """Return the random draws of the disturbance by name, for the context of an episode; by default none."""
         return {}
 
     def records(self, state: Any) -> dict[str, Array]:
-        """Return further values to record at each measurement, by name (:meth:`.World.records`)."""
+        """Return further values to record at each measurement, by name; by default none."""
         return {}
 
 
 class Disturbances:
-    """The disturbances of a world, in the order in which they act and use the random numbers of measurements.
+    """List of a world's disturbances, in the order in which they act and use random numbers.
 
-    States are a mapping from names.
+    Their states are a mapping by name.
 
     Args:
-        parts: the disturbances.
         drawn: the same in the order in which they are drawn with an episode; default: that order.
 
     Attributes:
@@ -171,35 +153,33 @@ class Disturbances:
         kinds: Sequence[type[Disturbance]],
         drawn: Sequence[type[Disturbance]] = (),
     ) -> "Disturbances":
-        """Return those of the given kinds of disturbances that a task's parameters switch on.
+        """Return the disturbances of these kinds that a task's parameters switch on.
 
-        Args:
-            task: with its parameters.
-            kinds: in the order in which they act.
-            drawn: the kinds that are drawn first; the others follow in the order of ``kinds``.
+        ``kinds`` are in the order in which they act. Those ``drawn`` are drawn first, the others in the order of
+        ``kinds``.
         """
         parts = [kind(task) for kind in kinds if kind.is_enabled(task.parameters)]
         order = *drawn, *kinds
         return cls(parts, sorted(parts, key=lambda part: order.index(type(part))))
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> dict[str, Any]:
-        """Draw the quantities of every disturbance and return their states at the start of the track, by name."""
+        """Draw all disturbances of each episode; return their states at the start of the track, by name."""
         shares, used = {}, 0
         for part in self.parts:
             shares[part.name] = normals[used : used + part.initial_normals]
             used += part.initial_normals
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
-    def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
+    def draw_further(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
         """Return the states with the quantities added that only some scenarios draw."""
-        return self._draw(lambda part: part.complete(states[part.name], draws))
+        return self._draw(lambda part: part.draw_further(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
         states = {part.name: draw(part) for part in self.drawn}
         return {part.name: states[part.name] for part in self.parts}
 
     def switch_off(self, states: dict[str, Any], undisturbed: Array | None) -> dict[str, Any]:
-        """Return the states with hidden disturbances switched off in the episodes where ``undisturbed`` is true."""
+        """Return the states with hidden disturbances switched off in the episodes where ``undisturbed``."""
         if undisturbed is None:
             return states
         return {part.name: part.switch_off(states[part.name], undisturbed) for part in self.parts}
@@ -207,7 +187,7 @@ class Disturbances:
     def split_noise(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Return the inputs of all disturbances by name, with the random numbers of a measurement split among them."""
+        """Return each disturbance's input by name: its share of a measurement's random numbers, and the time."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -220,19 +200,19 @@ class Disturbances:
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Return the relative deviations of the white errors, ``(..., N)``, as changed by every disturbance in turn."""
+        """Return the white errors' relative deviations, ``(..., N)``, changed by every disturbance in turn."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Return the sensor errors, ``(n, N)``, as changed by every disturbance in turn."""
+        """Return the sensor errors, ``(n, N)``, changed by every disturbance in turn."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """Return the states, and the sensor reading, ``(n, N)``, as changed by every disturbance in turn."""
+        """Return the states, and the sensor reading ``(n, N)`` changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -241,7 +221,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """Return the states, and the measurement as changed by every disturbance in turn."""
+        """Return the states, and the measurement changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -249,7 +229,7 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the random draws of all disturbances for the context of an episode, by name."""
+        """Return the random draws of all disturbances by name, for the context of an episode."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
@@ -258,17 +238,14 @@ class Disturbances:
 
 
 def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
-    """Return the causes of several classes of disturbances as one tuple."""
+    """Return the causes of cost that several classes of disturbances declare, as one tuple."""
     return tuple(cause for kind in kinds for cause in kind.causes)
 
 
 class Outliers(Disturbance):
-    """Measurements whose errors are larger than stated, independent of each other and not reported.
+    """Disturbance by outliers: errors larger than stated, independent of each other and not reported.
 
     Its state is the standard deviation of this measurement's errors over that of usual ones, ``(N,)``.
-
-    Args:
-        task: with its parameters.
 
     Attributes:
         probability: probability that a measurement is an outlier.
@@ -280,12 +257,12 @@ class Outliers(Disturbance):
 
     def __init__(self, task: TaskBase) -> None:
         super().__init__(task)
-        self.probability, self.factor = self.limits(self.parameters)
+        self.probability, self.factor = self.probability_and_factor(self.parameters)
         self.row_uniforms = 1 if self.probability else 0
 
     @staticmethod
     @abstractmethod
-    def limits(parameters: Any) -> tuple[float, float]:
+    def probability_and_factor(parameters: Any) -> tuple[float, float]:
         """Return the probability of an outlier and the factor on its standard deviation, from the parameters."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
@@ -293,7 +270,7 @@ class Outliers(Disturbance):
         return zero + 1.0
 
     def advance(self, state: Array, step: DisturbanceInput) -> Array:
-        """Return the drawn factor on this measurement's standard deviations, ``(N,)``: one, or that of an outlier."""
+        """Return the drawn factor on this measurement's standard deviations, ``(N,)``: one, or an outlier's."""
         if not self.probability:
             return state
         one = self.xp.ones_like(state)
@@ -301,7 +278,7 @@ class Outliers(Disturbance):
 
 
 class Glint(Outliers):
-    """Glint: radar errors multiplied by ``glint_factor`` with probability ``glint_probability``."""
+    """Disturbance by radar glint: errors multiplied by ``glint_factor`` with probability ``glint_probability``."""
 
     name = "glint"
 
@@ -311,7 +288,7 @@ class Glint(Outliers):
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
-    def limits(parameters: Any) -> tuple[float, float]:
+    def probability_and_factor(parameters: Any) -> tuple[float, float]:
         """Return the probability and the factor of glint, from the parameters."""
         return parameters.glint_probability, parameters.glint_factor
 
@@ -321,9 +298,7 @@ class Glint(Outliers):
 
 
 class GaussMarkov(NamedTuple):
-    """Coloured error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n`` (first-order Gauss-Markov):
-    multipath, the atmosphere, a reference that wanders. It is stationary from the start.
-    """
+    """Stationary first-order Gauss-Markov error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n``."""
 
     decay: Array
     """psi, factor on the error from one measurement to the next, ``(N,)``."""
@@ -334,7 +309,7 @@ class GaussMarkov(NamedTuple):
     def sampled(
         cls, deviation: Array, correlation_time: Array, interval: float, xp: ModuleType
     ) -> "GaussMarkov":
-        """Return the exactly discretised process of a stationary standard deviation and a correlation time.
+        """Return the exact discretisation of a process with a stationary deviation and a correlation time.
 
         Args:
             deviation: sigma, ``(N,)``.
@@ -351,7 +326,7 @@ class GaussMarkov(NamedTuple):
 
 
 class ColouredErrorsState(NamedTuple):
-    """State of :class:`ColouredErrors`."""
+    """State of coloured errors: drawn standard deviation, Gauss-Markov process, current errors."""
 
     deviation: Array
     """Stationary standard deviation, ``(..., N)``."""
@@ -361,10 +336,9 @@ class ColouredErrorsState(NamedTuple):
 
 
 class ColouredErrors(Disturbance):
-    """Errors correlated in time, added to the white ones at a fixed interval; a measurement does not report them.
+    """Disturbance by errors that are correlated in time, added to the white ones and not reported.
 
     Args:
-        task: with its parameters.
         interval: from one measurement to the next, s.
         count: n, errors of a measurement.
         present: whether there may be any; else they are zero and use no random numbers.
@@ -384,13 +358,11 @@ class ColouredErrors(Disturbance):
         """Draw the stationary standard deviation and the correlation time, s, each ``(N,)`` or ``(n, N)``."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> tuple[Array, Array]:
-        """Return the normal numbers and zeros with which :meth:`complete` draws the initial errors."""
+        """Return the normal numbers and zeros from which :meth:`draw_further` makes the initial errors."""
         return normals, zero
 
-    def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
-        """Return the process of the errors with drawn standard deviation and correlation time, stationary from the
-        start.
-        """
+    def draw_further(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
+        """Return the state with drawn deviation and correlation time; the errors are stationary from the start."""
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)
         process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)
@@ -398,7 +370,7 @@ class ColouredErrors(Disturbance):
         return ColouredErrorsState(deviation, process, level)
 
     def switch_off(self, state: ColouredErrorsState, undisturbed: Array) -> ColouredErrorsState:
-        """Return the state with the errors set to zero in the episodes where ``undisturbed`` is true."""
+        """Return the state with errors of zero in the episodes where ``undisturbed``."""
         deviation, kick, level = (
             self.xp.where(undisturbed, 0.0, each)
             for each in (state.deviation, state.process.kick, state.level)

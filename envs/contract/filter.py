@@ -1,11 +1,10 @@
 """Filters, and the likelihood that they report.
 
-A **filter** starts at the initial estimate given to every filter, predicts to every measurement, updates with it, and
-reports mean and covariance. Every competitor is a filter: a bank of filters that a policy steers, an estimator of a
-user, a learned estimator, a reference with additional information, a bound. So one rollout and one compilation serve
-all of them.
+A **filter** starts at a given initial estimate, predicts to every measurement, updates with it, and reports mean and
+covariance. Every competitor is a filter: a bank that a policy steers, an estimator of a user, a learned estimator, a
+reference with additional information, a bound.
 
-State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
+State and measurement are NamedTuples of arrays ``(..., N)``, which are never changed in place.
 """
 
 import math
@@ -33,7 +32,7 @@ class Initial(NamedTuple):
 
 
 class FilterInput(NamedTuple):
-    """Input of a filter at a measurement."""
+    """Input of a filter at a measurement: the measurement, the truth for a reference, and the action."""
 
     measurement: Any
     truth: Any = None
@@ -43,7 +42,7 @@ class FilterInput(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """Likelihood of a measurement under its prediction."""
+    """Likelihood of a measurement under its prediction: log-likelihood, NIS and its degrees of freedom."""
 
     log_likelihood: Array
     """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
@@ -59,12 +58,12 @@ class Likelihood(NamedTuple):
 
     @classmethod
     def unknown(cls, like: Array) -> "Likelihood":
-        """Return a :class:`Likelihood` whose values are all NaN, in the shape of an array ``(N,)``."""
+        """Return a :class:`Likelihood` of NaN in the shape of an array ``(N,)``."""
         return cls(None).fill_unknown(like)
 
     @classmethod
     def of_records(cls, records: Mapping[str, Array]) -> "Likelihood":
-        """Return the :class:`Likelihood` contained in the records of a filter; None for missing values."""
+        """Return the :class:`Likelihood` contained in the records of a filter; missing values are None."""
         return cls(*(records.get(name) for name in cls._fields))
 
     def fill_unknown(self, like: Array) -> "Likelihood":
@@ -83,7 +82,7 @@ class ReportedParts(NamedTuple):
 
 
 class EstimateState(NamedTuple):
-    """State of a filter that consists of its estimate and the likelihood alone."""
+    """State of a filter that consists of estimate and likelihood alone."""
 
     mean: Array
     covariance: Array
@@ -91,11 +90,7 @@ class EstimateState(NamedTuple):
 
 
 class Filter(ABC, Generic[TaskT, Measurement, State]):
-    """Base class of every filter. Arrays of N episodes are ``(..., N)``, whereas policies have the batch first.
-
-    Args:
-        task: the estimation problem, with the constants that world and filter share.
-    """
+    """Base class of every filter. Arrays of N episodes are ``(..., N)``, whereas policies have the batch first."""
 
     knows: str = ""
     """Information that no competitor receives, in words; empty for a competitor."""
@@ -117,17 +112,17 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium space of the actions; here it has a single action."""
+        """Gymnasium space of the actions; here a single action, as a filter is not steered."""
         return gymnasium.spaces.Discrete(1)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Blocks of the agent's observation, computed from this filter's state and the measurement, in order."""
+        """Blocks of the agent's observation, computed from this filter's state and the measurement; by default none."""
         return ()
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Further quantities that a policy can compute from an observation."""
+        """Further quantities that a policy can compute from an observation; by default none."""
         return ()
 
     @abstractmethod
@@ -135,9 +130,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """Return the filter's state at the start of the track, from the initial mean and covariance."""
 
     def initialise(self, inputs: FilterInput) -> State:
-        """Return the filter's state at the start of the track from a whole input, whose measurement is the initial
-        estimate.
-        """
+        """Return the filter's state at the start from a whole input, whose measurement is the initial estimate."""
         return self.start(inputs.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
@@ -146,15 +139,15 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @abstractmethod
     def update(self, state: State, inputs: FilterInput) -> State:
-        """Return the state updated with the measurement to which it was predicted (step 4 of the clock).
+        """Return the predicted state updated with the measurement (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
-            inputs: the same measurement, and the further input of this filter.
+            inputs: the same measurement, the action, and what a reference knows of the truth.
         """
 
     def step(self, state: State, inputs: FilterInput) -> State:
-        """Return the state predicted to a measurement and updated with it, without an action."""
+        """Return the state predicted to the measurement of an input and updated with that input."""
         return self.update(self.predict(state, inputs.measurement), inputs)
 
     def mean(self, state: State) -> Array:
@@ -168,17 +161,11 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return covariance
 
     def feedback(self, state: State, measurement: Any) -> Any:
-        """Return the feedback to the world in a closed loop; None where :meth:`.Task.feedback` computes it from the
-        estimate.
-
-        Args:
-            state: after :meth:`start` or :meth:`update`.
-            measurement: of the last update, or the initial estimate.
-        """
+        """Return the feedback to the world in a closed loop; None if :meth:`.Task.feedback` computes it."""
         return None
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
-        """Return further values to record at each measurement, by name: ``(N,)`` each, ``mode_probability`` ``(M, N)``.
+        """Return further values to record at each measurement by name, ``(N,)``; ``mode_probability`` ``(M, N)``.
 
         The quality of the prediction is reported by ``log_likelihood`` (log-density of the measurement as it was
         predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
@@ -189,10 +176,9 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
 
 class Bank(Filter[TaskT, Measurement, State]):
-    """A filter, usually a set of parallel filters, that an action of the agent steers under one control.
+    """Base class of filters, usually several in parallel, that an action of the agent steers.
 
     Args:
-        task: the estimation problem.
         control: name under which the task offers this bank; several may share one class.
     """
 
@@ -208,7 +194,7 @@ class Bank(Filter[TaskT, Measurement, State]):
     @property
     @abstractmethod
     def blocks(self) -> Sequence[Block]:
-        """Blocks of the agent's observation, computed from this bank's state and the measurement, in order."""
+        """Blocks of the agent's observation, computed from this bank's state and the measurement."""
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:

@@ -20,10 +20,10 @@ Memory = dict[str, Any]
 
 
 class LiveInput:
-    """Converter of named live values into measurements of a task.
+    """Converter of live sensor values, given by name, into measurements of a task.
 
-    This class serves every task: the values are the arrays of its ``Measurement``, by their names. A task whose sensors
-    have simpler values has a subclass.
+    Here the values are the arrays of the ``Measurement``, by their names. A task whose sensors have simpler values has
+    a subclass.
 
     Values of N tracks are arrays ``(..., N)``. Those of one track lack this axis, and a single number is a float:
     arithmetic of floats takes a tenth of the time of that of small arrays.
@@ -70,7 +70,7 @@ class LiveInput:
         return shapes(self.measurement, [self.counter]), shapes(self.initial, ["mean", "covariance"])
 
     def read(self, values: Mapping[str, Any], name: str, shape: tuple[int, ...] = ()) -> Any:
-        """Return a value by its name as an array ``(*shape, N)``, ``shape`` for one track; NaN where it is missing.
+        """Return a value by its name as an array ``(*shape, N)``, for one track ``shape``; NaN if it is missing.
 
         Raises:
             ValueError: for a value that is no number, or has another shape.
@@ -98,19 +98,14 @@ class LiveInput:
         return array.reshape(shape) if shape else array.item()
 
     def read_all(self, values: Mapping[str, Any], names: Iterable[str], what: str) -> numpy.ndarray:
-        """Return several numbers, none of which may be missing, as ``(len(names), N)``; for one track
-        ``(len(names),)``.
-
-        Raises:
-            ValueError: if one is missing.
-        """
+        """Return several numbers by name, ``(len(names), N)``, for one track ``(len(names),)``; none may be missing."""
         found = numpy.array([self.read(values, name) for name in names])
         if not numpy.isfinite(found).all():
             raise ValueError(f"{self.task.id} needs {', '.join(names)} {what}, got {_listed(values)}")
         return found
 
     def check_names(self, values: Mapping[str, Any], known: Mapping[str, str]) -> None:
-        """Raise ValueError if there is a value whose name is not among the known ones."""
+        """Raise ValueError if a value's name is unknown."""
         if values.__class__ is not dict and not isinstance(values, Mapping):
             raise ValueError(f"values are given by name, got {quote_shortened(values)}")
         if not values.keys() <= known.keys():
@@ -121,7 +116,7 @@ class LiveInput:
             )
 
     def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the initial estimate from its values by name, and the memory for the first measurement.
+        """Return the initial estimate from values by name, and the memory for the first measurement.
 
         Args:
             time: of the start, s, ``(N,)``, of one track a float.
@@ -138,17 +133,13 @@ class LiveInput:
         return type(self.initial)(**found), {"time": time, "count": self.broadcast(0.0)}
 
     def broadcast(self, number: float, shape: tuple[int, ...] = ()) -> Any:
-        """Return an array ``(*shape, N)`` filled with one number; for one track ``shape``, or the number itself."""
+        """Return an array ``(*shape, N)`` filled with a number; for one track ``shape``, or the number itself."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
     def _read_finite(
         self, initial_values: Mapping[str, Any], name: str, like: numpy.ndarray, what: str
     ) -> Any:
-        """Return a value by its name, all of it finite, truncated to integers or booleans where ``like`` is.
-
-        Raises:
-            ValueError: for a value that is missing or not finite.
-        """
+        """Return a value by its name, truncated to integers or booleans where ``like`` is; it must be finite."""
         values, dtype = self.read(initial_values, name, like.shape[:-1]), like.dtype
         if numpy.count_nonzero(numpy.isfinite(values)) < numpy.size(values):
             raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(initial_values)}")
@@ -157,7 +148,7 @@ class LiveInput:
         return values > 0.5 if dtype.kind == "b" else numpy.trunc(values)
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the task's ``Measurement`` from the values of one time, and the memory for the next one.
+        """Return the task's ``Measurement`` from the values at one time, and the memory for the next one.
 
         Args:
             memory: of the previous measurements.
@@ -187,25 +178,16 @@ class LiveInput:
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Return initial mean and covariance by name from the first two measurements, each with its ``time``.
-
-        Raises:
-            ValueError: if two measurements cannot start a track of this task, or a value is missing.
-        """
+        """Return the initial mean and covariance by name from two measurements with ``time``; here raise ValueError."""
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Return the array of values with numbers in place of those not received; by default zeros."""
+        """Return the values with numbers in place of those not received; by default zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
 class LiveValues:
-    """Live values of several tracks, in the form of :class:`~.log_format.Readings`.
-
-    Args:
-        input: converter that reads them.
-        values: by name; a missing one is None, NaN or omitted.
-    """
+    """Live values of several tracks at one time, in the form of :class:`~.log_format.Readings`."""
 
     def __init__(self, input: LiveInput, values: Mapping[str, Any]) -> None:
         self.input = input
@@ -216,19 +198,14 @@ class LiveValues:
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the value of a name for each track, ``(N,)``; NaN where it is missing."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:
-        """Return the name of the track with this index, for an error message."""
+        """Return the name of a track by its index, for an error message."""
         return f"track {number}"
 
     def deviations(self, name: str) -> Any:
-        """Return the standard deviations stated under a name, ``(N,)``, a float for one track; NaN where there is none.
-
-        Raises:
-            ValueError: if one is not above zero.
-        """
+        """Return the positive standard deviations stated under a name, ``(N,)``, for one track a float; NaN: none."""
         found = self.input.read(self.values, name)
         if found.__class__ is not float or found <= 0.0:
             check_deviations(self, name, numpy.atleast_1d(found))
@@ -236,13 +213,13 @@ class LiveValues:
 
 
 class LiveReader(NamedTuple):
-    """Class that converts single values to measurements of a problem."""
+    """Companion of a problem: its class of converters of live values."""
 
     input: type[LiveInput] = LiveInput
 
     @classmethod
     def of(cls, task: Any) -> "LiveReader":
-        """Return the reader of a task, or of a class of tasks; by default one that takes its arrays by their names."""
+        """Return the :class:`LiveReader` of a task or class of tasks; by default that of :class:`LiveInput`."""
         return find_companion(task, cls) or cls()
 
 

@@ -28,7 +28,7 @@ class Column(NamedTuple):
 
     @property
     def live_text(self) -> str:
-        """Unit and meaning of the column as a live value."""
+        """Unit and meaning of the column, as the description of a live value."""
         return self.live or self.text
 
 
@@ -40,7 +40,7 @@ class Readings(Protocol):
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column by its name, ``(n,)``; NaN where one is missing."""
+        """Return the numbers in a column by its name, ``(n,)``; NaN where one is missing."""
         ...
 
     def place(self, number: int) -> str:
@@ -49,24 +49,12 @@ class Readings(Protocol):
 
 
 def optional_column(readings: Readings, name: str, count: int) -> numpy.ndarray:
-    """Return the numbers of a column, ``(n,)``; all NaN if the column does not exist.
-
-    Args:
-        readings: given.
-        name: of the column.
-        count: n.
-    """
+    """Return the numbers in a column, ``(count,)``; all NaN if the column does not exist."""
     return readings[name] if readings.has(name) else numpy.full(count, numpy.nan)
 
 
 def check_deviations(readings: Readings, name: str, values: Any) -> None:
-    """Raise ValueError if a standard deviation of a column is not above zero.
-
-    Args:
-        readings: source of the values.
-        name: of the column.
-        values: ``(n,)``; NaN where none is stated.
-    """
+    """Raise ValueError if a standard deviation in a column is not above zero; NaN is accepted."""
     wrong = numpy.asarray(values <= 0.0)
     if wrong.any():
         place = int(wrong.argmax())
@@ -82,7 +70,7 @@ UNITS = {"azimuth_sigma": "degrees"}
 
 
 def is_assumed(words: str) -> bool:
-    """Return whether this description of the source of deviations marks them as assumed, not read from a column."""
+    """Return whether this description of the source of deviations marks them as assumed, not read."""
     return words.startswith(NO_DEVIATIONS)
 
 
@@ -103,7 +91,7 @@ class TrackStart(NamedTuple):
 
 
 class TrackLog(NamedTuple):
-    """The T measurements of one track, from the columns of a table."""
+    """Result of reading a log: the T measurements of one track."""
 
     measurements: Mapping[str, numpy.ndarray]
     """Arrays of the measurements, ``(T, ...)``."""
@@ -129,7 +117,7 @@ class TrackLog(NamedTuple):
 
 
 class PredictedCoordinate(NamedTuple):
-    """A coordinate of a measurement, compared with its prediction by an estimate."""
+    """Name and unit of a measured coordinate that is compared with its prediction."""
 
     name: str
     unit: str
@@ -138,9 +126,7 @@ class PredictedCoordinate(NamedTuple):
 
 
 class PlainRows(NamedTuple):
-    """Rows of a table that are measurements without a conversion: the ``Measurement`` has
-    ``values`` and ``available``, and perhaps ``interval`` and ``inputs``.
-    """
+    """Format of tables whose rows are measurements of ``values`` and ``available``, without a conversion."""
 
     received: tuple[str, ...]
     """Columns of the numbers of ``values``; an empty cell is a value that was not received."""
@@ -155,7 +141,7 @@ class PlainRows(NamedTuple):
 
 
 class PlotRows(NamedTuple):
-    """Rows of a table that are plots of a track, which starts from the first two of them."""
+    """Format of tables whose rows are radar plots of a track, which starts from the first two."""
 
     farthest: float
     """Largest distance from the origin, m."""
@@ -169,7 +155,7 @@ class PlotRows(NamedTuple):
 
 @dataclass(frozen=True)
 class LogFormat:
-    """Format of the tables of real measurements that an environment reads."""
+    """Format of the logs (tables of real measurements) that an environment reads."""
 
     columns: Mapping[str, Column]
     """The columns beside ``time``, by their names."""
@@ -209,7 +195,7 @@ class LogFormat:
 
 
 class LogSetup(NamedTuple):
-    """Setup with which a log was read, so that a filter runs on the same input later."""
+    """Parameters and assumptions with which a log was read, so that a filter runs on the same input later."""
 
     interval: float
     """Median time between measurements, s: the filter was evaluated with a missed scan wherever more time passes."""
@@ -228,18 +214,18 @@ class LogSetup(NamedTuple):
     """Measurements of the longest track; zero: not known."""
 
     def scenario(self, task: Any) -> Scenario:
-        """Return a :class:`Scenario` with the parameters of the log, which replaces a simulated scenario."""
+        """Return a :class:`Scenario` with the parameters of the log, in place of a simulated one."""
         log_format: Any = find_companion(task, LogFormat)
         known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
         return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:
-        """Origin of the plane of metres east and north; None where positions were in metres."""
+        """Origin of the plane of metres east and north; None where the log had positions in metres."""
         return PlaneOrigin(**self.origin) if self.origin else None
 
     @property
     def assumed(self) -> dict[str, float]:
-        """Parameter ``range_sigma`` with the deviation assumed for a log that stated none; empty if it stated any."""
+        """Parameter ``range_sigma`` with the deviation assumed for a log that stated none; else empty."""
         isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
         return {} if isotropic is None else {"range_sigma": isotropic}

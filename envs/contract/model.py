@@ -1,8 +1,7 @@
 """The model of an environment: a task with a filter in the loop.
 
-The engine, the Gymnasium classes and every evaluation step a :class:`Model`. Its methods are the clock of the task, see
-:mod:`.task`; on NumPy and torch they are the functions of world and filter one after another, and
-:class:`~.compiled.CompiledModel` runs the same ones as code of the processor.
+The engine, the Gymnasium classes and every evaluation step a :class:`Model`. Its methods are the clock of the task,
+see :mod:`.task`; :class:`~.compiled.CompiledModel` runs the same ones as compiled code.
 """
 
 import copy
@@ -22,7 +21,7 @@ from .task import Task, named_arrays
 
 
 class Episode(NamedTuple):
-    """N episodes at one moment: everything that the engine stores between steps."""
+    """State of N episodes: everything that the engine stores between steps."""
 
     truth: Any
     """True state; the world's NamedTuple."""
@@ -33,7 +32,7 @@ class Episode(NamedTuple):
 
 
 class Model:
-    """A task with a filter in the loop, for N independent episodes.
+    """A task with a filter in the loop, whose methods step N independent episodes.
 
     Args:
         task: the estimation problem; compiled models share it with those that are not.
@@ -62,11 +61,9 @@ class Model:
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
-        """Return the model itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Return the constructor's arguments for pickling, without computed values."""
         return type(self), (self.task, self.control)
 
     @property
@@ -83,7 +80,7 @@ class Model:
         return self._blocks.columns(names)
 
     def reader(self, name: str) -> Reader:
-        """Return a function from observations to the uncompressed values of a block or quantity, by its name.
+        """Return a function that computes a named block or quantity, uncompressed, from observations.
 
         Raises:
             ValueError: for a name that is neither.
@@ -101,8 +98,7 @@ class Model:
     def with_filter(self, make: Callable[["Model"], Filter[Any, Any, Any]]) -> "Model":
         """Return a model of the same task with another filter in place of the bank.
 
-        Args:
-            make: makes the filter for a model. Pass the same function each time: compiled code is stored by it.
+        Pass the same function each time: compiled code is stored by it.
         """
         other = copy.copy(self)
         other._take_filter(make(self))
@@ -112,11 +108,8 @@ class Model:
         """Return ``function(model, *parts)``, computed on this model's backend.
 
         Args:
-            function: of this module or another; pass the same one each time, since it may be compiled once.
+            function: of model and arrays; pass the same one each time, since it may be compiled once.
             *parts: nested tuples of arrays ``(..., N)``.
-
-        Returns:
-            Nested tuples or dictionaries of arrays ``(..., N)``.
         """
         return function(self, *parts)
 
@@ -126,7 +119,7 @@ class Model:
         return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
-        """Return the truth for a reference filter that ``knows`` something; None for any other filter."""
+        """Return the truth for a reference, a filter that ``knows`` a part of it; None for any other filter."""
         return truth if self.filter.knows else None
 
     # --- the filter's part of a step
@@ -155,17 +148,17 @@ class Model:
     # --- called by the engine
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Return N episodes at the start of the track, from their random numbers.
+        """Return N episodes at the start of the track, made from random numbers.
 
         Args:
-            uniforms: ``(noise.uniforms, N)``, of the task.
+            uniforms: ``(noise.uniforms, N)``.
             normals: ``(noise.initial_normals, N)``.
         """
         truth, initial = self.task.world.begin(Draws(uniforms, self.task.xp), normals)
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock).
+        """Return the episodes at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock).
 
         Args:
             episode: after :meth:`begin` or :meth:`act`.
@@ -183,9 +176,7 @@ class Model:
         return self._blocks.observe(episode.filter, episode.measurement)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """Return the episode after the filter's update with the measurement; a bank uses the action (step 4 of the
-        clock).
-        """
+        """Return the episodes after the filter's update with the measurement; a bank uses the action (step 4)."""
         truth = self.truth_for_filter(episode.truth)
         return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
@@ -194,12 +185,12 @@ class Model:
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
-        """Return the random draws of the episode and their current values by name, floats ``(..., N)``."""
+        """Return the episode's random draws and their current values by name, floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
     def moment(self, episode: Episode) -> Moment:
-        """Return the :class:`Moment` of the episode, from which causes are computed."""
+        """Return the :class:`Moment` of the episodes, from which causes of cost are computed."""
         world, measurement = self.task.world, episode.measurement
         return Moment(
             self.task.xp,
@@ -211,9 +202,7 @@ class Model:
         )
 
     def causes(self, episode: Episode) -> Array:
-        """Return the causes that are true at the measurement, encoded as one number, ``(N,)``
-        (:func:`.causes.cause_number`).
-        """
+        """Return the causes of cost at the measurement as one number ``(N,)``, see :func:`.causes.cause_number`."""
         return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
@@ -233,18 +222,12 @@ class Model:
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """Return the arrays for a picture by name: ``truth`` if known, ``estimate``, ``covariance``,
-        ``measurement_NAME``.
-        """
+        """Return ``truth`` if known, ``estimate``, ``covariance`` and the arrays ``measurement_NAME``, by name."""
         measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
         return {**self._truth_and_estimate(episode), **measured}
 
     def picture_track(self, episode: Episode) -> dict[str, Array]:
-        """Return ``truth`` if known, ``estimate``, ``covariance``, and ``seen``, the readings of the components ``(C,
-        N)``.
-
-        ``seen`` is absent where the world has no such readings, and NaN where a component was not measured.
-        """
+        """Return arrays for a picture by name: ``truth`` if known, ``estimate``, ``covariance``, ``seen`` readings."""
         seen = self.task.world.component_readings(episode.measurement)
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}
 
@@ -258,7 +241,7 @@ class Model:
         return {"truth": truth, **estimate}
 
     def records(self, episode: Episode) -> dict[str, Array]:
-        """Return further values to record at a measurement, by name, of filter and world."""
+        """Return further values of filter and world to record at a measurement, by name."""
         records = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),

@@ -1,8 +1,8 @@
 """Observations: a list of blocks, from which fields, values and their decoding follow.
 
 A :class:`Block` is one quantity of the observation: a function of the state of the filters, and the
-:class:`Compression` of its values. The base class of the banks derives the observation from the list, and a
-:class:`Reader` that inverts it: policies never undo a compression by hand.
+:class:`Compression` of its values. The base class of the banks derives from the list the observation, and a
+:class:`Reader` that inverts it.
 """
 
 import functools
@@ -19,7 +19,7 @@ Array = Any
 
 
 class Field(NamedTuple):
-    """One component of the observation."""
+    """One component of the observation: name, unit and description."""
 
     name: str
     unit: str
@@ -32,7 +32,7 @@ class Field(NamedTuple):
 
 
 class Compression(NamedTuple):
-    """An invertible compression of values."""
+    """An invertible compression of observed values."""
 
     text: str
     """Text in front of the description of a block."""
@@ -59,7 +59,7 @@ PLAIN = Compression("", None, None)
 
 
 def limited(low: float, high: float) -> Compression:
-    """Return a :class:`Compression` that changes nothing, for values within these limits."""
+    """Return the identity as a :class:`Compression`, for values within these limits."""
     return Compression("", None, None, (low, high))
 
 
@@ -76,13 +76,13 @@ LIMIT = 8.0
 
 
 def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
-    """Return ``y / (1 + |y| / 8)`` with y the symmetric logarithm of a value; its magnitude stays below 8."""
+    """Return ``y / (1 + |y| / 8)`` of ``y = symlog(value)``; its magnitude stays below 8."""
     logarithm = symlog(value, xp)
     return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
 
 
 def bounded_exponential(compressed: numpy.ndarray) -> numpy.ndarray:
-    """Return the values x whose ``bounded_logarithm(x)`` is ``compressed``: the inverse of that function."""
+    """Return the inverse of :func:`bounded_logarithm`."""
     return symexp(compressed / (1.0 - numpy.abs(compressed) / LIMIT), numpy)
 
 
@@ -135,7 +135,7 @@ class Block(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """Quantity that can be computed from an observation, such as an innovation in metres."""
+    """Quantity that a policy can compute from an observation, such as an innovation in metres."""
 
     name: str
     unit: str
@@ -149,12 +149,10 @@ Reader = Callable[[numpy.ndarray], numpy.ndarray]
 
 
 class Blocks:
-    """An observation made of blocks, and the functions that decode it.
+    """Observation made of blocks, and the functions that decode it.
 
     Args:
-        blocks: in the order of the observation.
         quantities: further quantities that can be read from it.
-        xp: array namespace.
 
     Raises:
         ValueError: if two fields, or two blocks or quantities, have the same name.
@@ -209,11 +207,7 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Return the positions of fields in the observation, by their names.
-
-        Raises:
-            ValueError: for a name that is no field.
-        """
+        """Return the positions of fields in the observation, by their names; ValueError for a name that is no field."""
         positions = {field.name: i for i, field in enumerate(self.fields)}
         missing = [name for name in names if name not in positions]
         if missing:
@@ -236,7 +230,7 @@ class Blocks:
         return {block.name: block.compression.inverse for block in self.blocks}
 
     def reader(self, name: str) -> Reader:
-        """Return a function from observations to the uncompressed values of a block or quantity, by its name.
+        """Return a function that computes a named block or quantity, uncompressed, from observations.
 
         Raises:
             ValueError: for a name that is neither.
@@ -253,10 +247,9 @@ class Blocks:
 
 
 class DecisionMeans:
-    """Observation fields that are averaged over the measurements for which one action holds.
+    """Averages of observation fields over the measurements for which one action holds.
 
     Args:
-        fields: of the observation.
         interval: measurements of a decision.
 
     Attributes:
@@ -274,17 +267,11 @@ class DecisionMeans:
         return total + observation[self.columns]
 
     def write(self, observation: numpy.ndarray, total: numpy.ndarray) -> None:
-        """Replace the averaged fields of an observation in place by ``total`` over the number of measurements."""
+        """Replace the averaged fields of an observation, in place, by ``total`` divided by the interval."""
         observation[self.columns] = total / self.interval
 
     def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:
-        """Return a copy of an observation, ``(fields, N)``, whose averaged fields contain their means.
-
-        Args:
-            observation: of the last measurement.
-            total: sum over all measurements since the last decision.
-            xp: array namespace.
-        """
+        """Return a copy of an observation, ``(fields, N)``, with the averaged fields replaced by their means."""
         if isinstance(observation, numpy.ndarray):
             shown = observation.copy()
             self.write(shown, total)
@@ -333,12 +320,12 @@ def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ())
 
 
 def nis_block(parts: Sequence[str] = ()) -> Block:
-    """Return the observation block of the normalised innovation squared (NIS), ``nis`` of the state."""
+    """Return the observation block of the normalised innovation squared (NIS)."""
     return Block("nis", lambda f, _: f.nis, "normalised innovation squared", parts, LOG1P)
 
 
 def log_squared_block(parts: Sequence[str] = ()) -> Block:
-    """Return the observation block of ``log(1 + NIS)``, which the state stores as ``log_squared``."""
+    """Return the observation block of ``log(1 + NIS)``."""
     return Block(
         "log_squared_innovation",
         lambda f, _: f.log_squared,
@@ -349,11 +336,9 @@ def log_squared_block(parts: Sequence[str] = ()) -> Block:
 
 
 def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
-    """Return the observation block of the running average of ``log(1 + NIS)``, ``average_log_squared`` of the state.
+    """Return the observation block of the running average of ``log(1 + NIS)``.
 
-    Args:
-        average: over which measurements, in words.
-        parts: suffixes of the rows.
+    ``average`` names the measurements of the average, in words.
     """
     return Block(
         "average_log_squared_innovation",
@@ -370,13 +355,9 @@ def expected_nis_block(
     text: str = "the hypotheses' mean normalised innovation squared",
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the observation block of the NIS averaged over a bank's hypotheses; zero where nothing was received.
+    """Return the observation block of a bank's NIS averaged over its hypotheses; 0 without a measurement.
 
-    Args:
-        xp: array namespace.
-        received: from a measurement to booleans, ``(N,)``.
-        text: meaning, in words.
-        over_interval: its value over several measurements, see :class:`Field`.
+    ``received`` is a function from a measurement to booleans, ``(N,)``; for ``over_interval`` see :class:`Field`.
     """
     return Block(
         "squared_innovation",
@@ -402,24 +383,21 @@ def relative_likelihood_block(
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
-    """Return the observation block of the log-density of a measurement in its usual units."""
+    """Return the observation block of the log-density of a measurement under its prediction."""
     return Block(name, value, text, compression=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
     parts: Sequence[str], text: str = "the logarithm of the predicted probability"
 ) -> Block:
-    """Return the observation block of the log-predicted mode probabilities, ``log_predicted`` of the state."""
+    """Return the observation block of log-predicted mode probabilities that the state stores."""
     return Block("log_predicted", lambda f, _: f.log_predicted, text, parts, SIGNED_LOG)
 
 
 def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: str = "") -> Block:
-    """Return the observation block of the logarithms of a bank's predicted probabilities, ``predicted`` of the state.
+    """Return the observation block of a bank's predicted probabilities, as logarithms.
 
-    Args:
-        parts: suffixes of the rows.
-        measurement: word for a measurement.
-        of: words for the hypotheses, such as " of the level".
+    ``measurement`` is the word for one, ``of`` words for the hypotheses, such as " of the level".
     """
     return Block(
         "log_predicted",
@@ -442,7 +420,7 @@ def probability_block(
 
 
 def entropy_block(xp: ModuleType) -> Block:
-    """Return the observation block of the entropy of the hypotheses' probabilities, ``entropy`` of the state."""
+    """Return the observation block of the entropy of the hypotheses' probabilities."""
     return Block(
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
@@ -456,14 +434,14 @@ def prior_block(
     text: str = "the sigma of the predicted position over that of the measurement",
     value: Value = lambda f, _: f.prior,
 ) -> Block:
-    """Return the observation block of the predicted over the measured deviation, of which the state has the log."""
+    """Return the observation block of the predicted over the measured standard deviation, as a logarithm."""
     return Block("prior", value, text, parts, STORED_AS_LOG)
 
 
 def last_action_block(
     parts: Sequence[str] = (), name: str = "last_action", compression: Compression = ACTION
 ) -> Block:
-    """Return the observation block of the previous action, ``action`` of the state."""
+    """Return the observation block of the previous action."""
     return Block(name, lambda f, _: f.action, "action applied before", parts, compression)
 
 
@@ -472,14 +450,14 @@ def last_weight_block(
     value: Callable[[Any], Array] = lambda f: f.probabilities,
     text: str = "weight before this scan",
 ) -> Block:
-    """Return the observation block of the hypotheses' weights before this measurement; by default ``probabilities``."""
+    """Return the observation block of the hypotheses' weights before this measurement."""
     return Block("last_weight", lambda f, _: value(f), text, parts, SHARE)
 
 
 def availability_block(
     text: str = "1 where a value was received", parts: Sequence[str] = (), over_interval: Interval = "last"
 ) -> Block:
-    """Return the observation block that is one where a measurement was received and zero elsewhere."""
+    """Return the observation block that is one where a measurement was received, else zero."""
     return Block(
         "available",
         lambda _, measurement: measurement.available,
@@ -491,7 +469,7 @@ def availability_block(
 
 
 def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
-    """Return the observation block of the share of the episode that has passed: ``number`` over the horizon."""
+    """Return the observation block of the share of the episode that has passed."""
     return Block(
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,

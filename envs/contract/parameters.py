@@ -6,8 +6,7 @@
         \"\"\"Standard deviation of the range, m (paper).\"\"\"
 
 The type of a field determines the values that it takes (number, whole number, boolean, word, tuples of them, None);
-:func:`parameter` declares further limits. Every error is a ``ValueError`` with the name, the value and the
-expected values.
+:func:`parameter` declares further limits. Errors state name, value and expected values.
 """
 
 import dataclasses
@@ -23,7 +22,7 @@ import numpy
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLimits:
-    """Limits of a parameter's value beside its type; of each number if the value is a sequence."""
+    """Limits of a parameter's value beside its type; in a sequence they hold for each number."""
 
     above: float | None = None
     at_least: float | None = None
@@ -37,13 +36,13 @@ class ParameterLimits:
 
 
 def parameter(default: Any, **limits: Any) -> Any:
-    """Return a dataclass field with a default value and :class:`ParameterLimits` for a parameter of a task."""
+    """Declare a task's parameter: return a dataclass field with a default and :class:`ParameterLimits`."""
     return dataclasses.field(default=default, metadata={"limits": ParameterLimits(**limits)})
 
 
 @dataclasses.dataclass(frozen=True)
 class TaskParameters:
-    """Parameters of every task. Subclasses may change defaults and check several fields together in :meth:`check`."""
+    """Base class of every task's parameters, which are checked on construction."""
 
     horizon: int = parameter(100, at_least=1)
     """Measurements acted on in one episode."""
@@ -51,11 +50,7 @@ class TaskParameters:
     """Measurements for which one action holds."""
 
     def __post_init__(self) -> None:
-        """Check every field against its type and limits, and convert lists to tuples.
-
-        Raises:
-            ValueError: with the name of the field, its value and the expected values.
-        """
+        """Check every field against its type and limits, and convert lists to tuples."""
         cls: Any = type(self)
         for name, (hint, limits) in field_limits(cls).items():
             value = freeze(getattr(self, name))
@@ -69,12 +64,12 @@ class TaskParameters:
         self.check()
 
     def check(self) -> None:
-        """Raise ValueError for fields that contradict each other; subclasses override it."""
+        """Raise ValueError for fields that contradict each other; by default none do."""
 
 
 @cache
 def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
-    """Return the type and the :class:`ParameterLimits` of every field of a parameters' dataclass, by name."""
+    """Return the type and :class:`ParameterLimits` of every field of a parameters' dataclass, by name."""
     hints = typing.get_type_hints(cls)
     return {
         f.name: (hints[f.name], f.metadata.get("limits", ParameterLimits())) for f in dataclasses.fields(cls)
@@ -89,11 +84,7 @@ def freeze(value: Any) -> Any:
 
 
 def check(name: str, value: Any, hint: Any, limits: ParameterLimits) -> None:
-    """Raise ValueError if a parameter's value violates its declared type or limits.
-
-    Raises:
-        ValueError: with the name, the value and the expected values.
-    """
+    """Raise ValueError if a parameter's value violates its declared type or limits."""
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         if value is None:
             return
@@ -178,11 +169,7 @@ def _integer(name: str, value: Any, limits: ParameterLimits) -> None:
 
 
 def check_integer(name: str, value: Any, at_least: int) -> int:
-    """Return a user's argument as an int, after a check that it is a whole number and not too small.
-
-    Raises:
-        ValueError: with the name, the value and the expected values.
-    """
+    """Return a user's argument as an int; raise ValueError unless it is a whole number and large enough."""
     value = freeze(value)
     _integer(name, value, ParameterLimits(at_least=at_least))
     return int(value)
@@ -216,7 +203,7 @@ def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: ParameterLimit
 
 
 def check_length(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
-    """Raise ValueError if a sequence parameter has not ``count`` elements, as another parameter requires."""
+    """Raise ValueError unless a sequence parameter has ``count`` elements, as another parameter requires."""
     if len(value) != count:
         raise ValueError(f"{name} must be {count} {what}, got {quote_shortened(value)}")
 

@@ -27,9 +27,8 @@ environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the
 real measurement that is not acted on.
 
 A :class:`Task` is the declaration of an author; :class:`TaskBase` derives the rest from it: the parameters, the
-constants computed from them and the world. Optional objects beside the declaration, such as the format of the logs or
-the picture, are companions, see :mod:`~.companions`. The engine runs a :class:`~.model.Model`: a task with a filter in
-the loop.
+constants computed from them and the world. Optional objects beside it, such as the format of logs, are
+:mod:`~.companions`. The engine runs a :class:`~.model.Model`: a task with a filter in the loop.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
@@ -70,7 +69,7 @@ class Component(NamedTuple):
 
 @dataclass(frozen=True)
 class Scenario:
-    """An immutable set of parameters with a name, and the windows in which its errors are reported."""
+    """A named immutable set of parameters, and the windows in which its errors are reported."""
 
     name: str
     description: str
@@ -97,7 +96,7 @@ class PaperPolicy(NamedTuple):
 
 
 class Reward(NamedTuple):
-    """Cost of an estimate, and the reward for it."""
+    """Description of a task's cost, its default kind of reward, and their units."""
 
     cost: str
     """Meaning and unit of the cost, in words."""
@@ -112,11 +111,10 @@ class Reward(NamedTuple):
 
 
 class Task(TaskBase):
-    """One estimation problem for N independent episodes; see the module's description.
+    """Base class of an estimation problem for N independent episodes; see the module's description.
 
-    Subclasses declare the class attributes below and compute in :meth:`set_up` the constants that world and
-    banks share. Their class docstring is the environment's documentation. :class:`TaskBase` derives the rest from the
-    declaration.
+    Subclasses declare the class attributes below. Their class docstring is the environment's documentation.
+    :class:`TaskBase` derives the rest from the declaration.
     """
 
     id: ClassVar[str]
@@ -153,7 +151,7 @@ class Task(TaskBase):
         """Compute the constants that world and banks share; an optional method of an environment's author."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Return the feedback to the world in a closed loop, computed from an estimate, such as a control command.
+        """Return the feedback of an estimate to the world, such as a control command; by default None, an open loop.
 
         A filter may return another one, see :meth:`.Filter.feedback`.
 
@@ -169,7 +167,7 @@ class Task(TaskBase):
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
-    """Yield the arrays of nested NamedTuples with their names, joined by underscores."""
+    """Yield the arrays in nested NamedTuples with their names, joined by underscores."""
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from named_arrays(value, f"{prefix}{name}_")
@@ -178,7 +176,7 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
 
 
 def field_texts(cls: type) -> dict[str, str]:
-    """Return the docstring below each field of a class as one line, by name; empty where there is none."""
+    """Return the docstrings below the fields of a class by name, each as one line; fields without one are left out."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
@@ -194,7 +192,7 @@ def field_texts(cls: type) -> dict[str, str]:
 
 
 def field_words(cls: type) -> dict[str, str]:
-    """Return the docstrings of a class's fields by name, without array shapes and without clauses on None."""
+    """Return the docstrings of a class's fields by name, without array shapes and clauses on None."""
     found = {}
     for name, text in field_texts(cls).items():
         words = re.sub(r"(, |^)``\([^`]*\)``\.?", "", text)

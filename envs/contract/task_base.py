@@ -16,7 +16,7 @@ from .observation import Array
 
 
 class NoiseLayout(NamedTuple):
-    """Counts of the random numbers of an episode.
+    """Counts of uniform and normal random numbers at the start and at each measurement of an episode.
 
     At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
     ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
@@ -30,15 +30,13 @@ class NoiseLayout(NamedTuple):
 
 
 class TaskBase(ABC):
-    """Base class that derives a task's world, constants and the course of its episodes from its declaration.
+    """Base class that derives from a task's declaration its world, its constants and the course of episodes.
 
     The author of a task writes only the declaration, :class:`~.task.Task`.
 
     Args:
-        parameters: an instance of the task's ``Parameters``.
         xp: array namespace, NumPy or torch.
-        device: of its arrays.
-        recording: that is replayed in place of a simulated world.
+        recording: replayed in place of a simulated world.
     """
 
     controls: ClassVar[tuple[str, ...]]
@@ -99,15 +97,13 @@ class TaskBase(ABC):
         """Return whether the task overrides :meth:`.Task.feedback`."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Return the task itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Return the constructor's arguments for pickling; the array namespace, a module, by its name."""
         return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
 
     def on(self, xp: ModuleType, device: Any = None) -> Self:
-        """Return the same task on arrays of another namespace and device."""
+        """Return the same task with its arrays in another namespace and on another device."""
         return type(self)(self.parameters, xp, device, self.recording)
 
     @functools.cached_property
@@ -137,8 +133,7 @@ class TaskBase(ABC):
 
     @property
     def interval(self) -> float | None:
-        """Constant time between measurements, s, also from the start of the track to the first one; None where the
-        times vary or are unknown.
+        """Constant time between measurements, s, also before the first; None where it varies or is unknown.
 
         It is the parameter ``sampling_interval`` where there is one, unless a recording has another.
         """
@@ -148,23 +143,18 @@ class TaskBase(ABC):
         return seconds
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between measurements from the parameters, s; None where it varies."""
         return getattr(self.parameters, "sampling_interval", None)
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Return the integer index of the flight that each episode flies, ``(N,)``, drawn from :attr:`flights`.
+        """Return the index of the flight that each episode flies, ``(N,)``, by its uniform numbers.
 
         Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
+            uniforms: ``(noise.uniforms, N)``; the first row draws the flight.
         """
         return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
 
     def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of measurements acted on in each episode, ``(N,)``.
-
-        Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``.
-        """
+        """Return the number of measurements acted on in each episode, ``(N,)``, by its uniform numbers."""
         if not self.flights:
             return numpy.full(uniforms.shape[1], self.horizon)
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]

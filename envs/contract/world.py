@@ -16,10 +16,7 @@ Measurement = TypeVar("Measurement")
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """Base class of the truth and the sensors of a task.
-
-    Args:
-        task: the estimation problem, with the constants that world and filter share.
+    """Base class of a task's world: the simulated truth and the sensors.
 
     Attributes:
         initial_normals: standard normal numbers of the track's start.
@@ -58,8 +55,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Return the true state at the start of the track, and the initial estimate given to every filter.
 
         Args:
-            draws: random numbers that fix the scenario of each episode.
-            normals: ``(initial_normals, N)``, the errors of the track's start.
+            draws: random quantities of each episode.
+            normals: ``(initial_normals, N)``, for the errors of the start.
 
         Returns:
             The truth, and an :class:`Initial` or a NamedTuple that has its fields.
@@ -81,14 +78,11 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return state
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with NaN in place of every value that was not received, for an estimator.
+        """Return the measurement with NaN for every value that was not received, as estimators get it.
 
         The filters of a bank weight a value by its availability, so its number does not matter to them. An estimator
         that ignores the availability must not use that number as a measurement. By default the values of
         ``received_field`` are replaced.
-
-        Args:
-            measurement: of :meth:`advance`.
         """
         if not self.received_field:
             return measurement
@@ -98,31 +92,24 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with zeros instead of None in fields that only recordings contain.
-
-        Args:
-            measurement: of :meth:`advance`.
-        """
+        """Return the measurement with zeros for None in fields that only recordings have; by default unchanged."""
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:
-        """Return the readings of the task's components, ``(C, N)`` in their units, for pictures.
+        """Return the readings of the task's components, ``(C, N)``, for pictures; by default None.
 
-        NaN where there is no reading; None, as by default, where the measured quantity is no component.
+        They are NaN where there is no reading, and None where the measured quantity is no component.
         """
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Return the stated standard deviations of :meth:`component_readings`, ``(C, N)``, or None."""
+        """Return the stated standard deviations of :meth:`component_readings`, ``(C, N)``; by default None."""
         return None
 
     def reading_deviations(self, measurement: Measurement) -> Array:
         """Return the standard deviations of the readings' errors, in the shape of the readings.
 
         By default the square roots of ``stated_field``; a subclass may return nominal ones.
-
-        Args:
-            measurement: of :meth:`advance`.
         """
         if not self.stated_field:
             raise NotImplementedError(
@@ -131,9 +118,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
-        """Return the cost of an estimation error, ``(N,)``, without the truth.
+        """Return the cost of an estimation error, ``(N,)``, without the truth; a subclass defines it or :meth:`cost`.
 
-        Where it is defined, :meth:`cost` need not be, and recordings of the task can be evaluated.
+        Only with it recordings of the task can be evaluated.
 
         Args:
             error: estimate minus truth, ``(C, N)``, in the units of the task's components.
@@ -143,8 +130,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def cost(self, truth: Truth, mean: Array) -> Array:
         """Return the uncapped cost of an estimate, ``(N,)`` (step 5 of the clock).
 
-        A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
-        control loop, the quadratic cost of the loop in a fixed unit.
+        By default :meth:`error_cost`; where the estimate drives a control loop, the quadratic cost of the loop.
 
         Args:
             truth: at the measurement that the estimate is for.
@@ -153,23 +139,19 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the part of the cost of an estimate that enters the reward, not negative, ``(N,)``.
+        """Return the part of an estimate's cost that enters the reward, not negative, ``(N,)``.
 
-        That is all of it, except a part that the estimate is known not to cause.
-
-        Args:
-            truth: at the measurement that the estimate is for.
-            mean: of the estimate, ``(C, N)``.
+        By default all of it; a task may exclude a part that the estimate does not cause.
         """
         return self.cost(truth, mean)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return further values of the truth to record at each measurement, by name: arrays ``(N,)``."""
+        """Return further values of the truth to record at each measurement by name, ``(N,)``; by default none."""
         return {}
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the random draws of the episode and their current values by name: finite arrays ``(..., N)``.
+        """Return the random draws of the episode and their current values by name, ``(..., N)``; by default none.
 
-        Their shapes are constant. The time of an event that does not occur is -1.
+        They are finite, their shapes constant. The time of an event that does not occur is -1.
         """
         return {}

@@ -8,7 +8,7 @@ TIME_UNITS = 1e9, 1e6, 1e3
 
 
 def time_unit(time: float) -> float:
-    """Return the units per second of a time stamp, by its magnitude: 1, or 1e3, 1e6, 1e9 for units since 1970.
+    """Return how many units of a time stamp are a second, by its size: 1, or 1e3, 1e6, 1e9 since 1970.
 
     1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
     """

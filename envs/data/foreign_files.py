@@ -1,8 +1,7 @@
 """Reading of files from outside: opened, measured and parsed under limits of memory and processor time.
 
-The path must be a file, no device, pipe or folder, and no larger than its reader accepts. JSON is counted before it is
-parsed. Formats that need other libraries (NetCDF-4, Parquet, ULog, bags, SQLite, YAML) are parsed in a process of their
-own (:mod:`.foreign_parsers`) with limits of memory and of processor time, which returns plain arrays.
+JSON is counted before it is parsed. Formats that need other libraries (NetCDF-4, Parquet, ULog, bags, SQLite, YAML)
+are parsed in a process of their own (:mod:`.foreign_parsers`), which returns plain arrays.
 
 A file that breaks a limit is refused in one sentence, with the way to raise it: ``FILTERGYM_READ_MEMORY`` in MB and
 ``FILTERGYM_READ_SECONDS`` in the environment.
@@ -40,7 +39,7 @@ SECONDS_OF_MEGABYTE = 0.5
 
 
 class ReadingLimits(NamedTuple):
-    """Limits of reading one file."""
+    """Limits of memory and processor time for reading one file."""
 
     memory: int
     """Memory, bytes."""
@@ -49,11 +48,7 @@ class ReadingLimits(NamedTuple):
 
 
 def limits() -> ReadingLimits:
-    """Return the limits of memory and processor time from environment variables, else the defaults.
-
-    Raises:
-        ValueError: if an environment variable is not a valid limit.
-    """
+    """Return the limits of memory and processor time for reading files, from environment variables or the defaults."""
     found = []
     for name, otherwise in ((MEMORY, 512.0), (SECONDS, 5.0)):
         try:
@@ -66,7 +61,7 @@ def limits() -> ReadingLimits:
     return ReadingLimits(int(found[0] * 1e6), found[1])
 
 
-def refuse_memory(what: str) -> ValueError:
+def memory_limit_error(what: str) -> ValueError:
     """Return a ValueError for a file whose part ``what`` needs more memory than the limit."""
     most = limits().memory / 1e6
     return ValueError(
@@ -77,10 +72,10 @@ def refuse_memory(what: str) -> ValueError:
 
 @contextlib.contextmanager
 def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
-    """Context manager that opens a file for reading in binary, if it is a regular file and not too large.
+    """Context manager: open a file for binary reading, if it is a regular file and not too large.
 
     Args:
-        path: path of the file.
+        path: its path.
         most: largest size, bytes.
 
     Raises:
@@ -119,13 +114,7 @@ def is_folder(path: Path) -> bool:
 def read_content(path: Path, most: int | None = None) -> bytes:
     """Return the bytes of a file, if it is a regular file and not too large.
 
-    Args:
-        path: path of the file.
-        most: largest size, bytes; default: the limit of memory.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: as of :func:`open_foreign`.
+    ``most`` is the largest size in bytes, by default the limit of memory.
     """
     most = limits().memory if most is None else most
     with open_foreign(path, most) as file:
@@ -136,17 +125,13 @@ def read_content(path: Path, most: int | None = None) -> bytes:
 
 
 def parse_json(content: bytes) -> Any:
-    """Return the value of a JSON text, after a check that it fits into the memory limit.
-
-    Raises:
-        ValueError: if it is no JSON, or larger.
-    """
+    """Return the value of a JSON text, after a check that it fits into the memory limit."""
     openings = content.count(b"{") + content.count(b"[")
     values = openings + content.count(b",") + content.count(b":")
     text = (3 if content.isascii() else 6) * len(content)
     most = text + BYTES_OF_VALUE * values + BYTES_OF_CONTAINER * openings
     if most > limits().memory:
-        raise refuse_memory(f"it holds {values:,} values, up to {most / 1e6:,.0f} MB")
+        raise memory_limit_error(f"it holds {values:,} values, up to {most / 1e6:,.0f} MB")
     try:
         return json.loads(content)
     except RecursionError:
@@ -154,7 +139,7 @@ def parse_json(content: bytes) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Return the decoded value of a JSON file, within the memory limit.
+    """Return the value in a JSON file, within the memory limit.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -164,7 +149,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the value of a YAML file: words, numbers, lists and mappings.
+    """Return the value in a YAML file: words, numbers, lists and mappings.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -183,7 +168,6 @@ _WARNED: list[bool] = []
 
 
 def _warn_without_limit() -> None:
-    """Warn, once, if the system cannot limit the memory of a process."""
     if sys.platform != "linux" and not _WARNED:
         _WARNED.append(True)
         warnings.warn(
@@ -200,17 +184,14 @@ def _has(library: str) -> bool:
 
 
 def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **options: Any) -> Any:
-    """Return the plain values of a file, parsed in a subprocess with limits of memory and processor time.
+    """Return the plain values in a file, parsed in a subprocess with limits of memory and processor time.
 
     Args:
         parser: name of one of :data:`.foreign_parsers.PARSERS`.
-        path: of the file.
+        path: its path.
         extra: extra of this package to install where the library is missing.
         most: largest size of the file, bytes.
         **options: arguments of the parser, plain values.
-
-    Returns:
-        The result of the parser.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -254,7 +235,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
     if head is None:
         raise _explain_end(code, seconds)
     if "memory" in head:
-        raise refuse_memory(head["memory"])
+        raise memory_limit_error(head["memory"])
     if "missing" in head:
         raise ValueError(f"it needs one more package: {extra}")
     if "error" in head:
@@ -263,9 +244,8 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 
 
 def _explain_end(code: int, seconds: float) -> ValueError:
-    """Return a ValueError for a parser process that ended without a result."""
     if code == 3:
-        return refuse_memory("its parser needs more memory")
+        return memory_limit_error("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU
         return ValueError(
             f"reading it took more than {seconds:.0f} s: it is damaged, or set {SECONDS}={4 * seconds:.0f} (s) if you "
@@ -275,7 +255,6 @@ def _explain_end(code: int, seconds: float) -> ValueError:
 
 
 def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
-    """Return the JSON head and the arrays that a parser process sent; None for an incomplete result."""
     size = answer.read(8)
     if len(size) < 8 or int.from_bytes(size, "little") > memory:
         return None, []
@@ -299,7 +278,6 @@ def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
 
 
 def _array_forms(value: Any) -> Iterator[tuple[str, list[int]]]:
-    """Yield the type and shape of each array that a head names, in their order."""
     if isinstance(value, dict):
         if "array" in value:
             yield value["dtype"], value["shape"]

@@ -5,8 +5,8 @@ path, and the limits. The file to read is open as standard input. The result goe
 head in eight bytes, the head in JSON, then the bytes of the arrays that the head names. Nothing of the package is
 imported here, so that a start costs a tenth of a second; a parser may use NumPy and its own library only.
 
-A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are defined here; names from a
-foreign file are in lists of pairs. It raises ``ValueError`` with a sentence for the user.
+A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are defined here; names from
+a file are in lists of pairs. It raises ``ValueError`` with a sentence for the user.
 """
 
 import json
@@ -28,11 +28,7 @@ MOST_NODES = 100_000
 
 
 def check_column_names(names: Sequence[str]) -> list[str]:
-    """Return the names of a table's columns in lower case.
-
-    Raises:
-        ValueError: if there are too many, one is too long, or two are equal.
-    """
+    """Return a table's column names in lower case; raise ValueError for too many, too long or equal names."""
     if len(names) > MOST_COLUMNS:
         raise ValueError(
             f"it has {len(names):,} columns, and a table has at most {MOST_COLUMNS:,}: leave some out"
@@ -57,7 +53,7 @@ def check_rows(count: int, most: int) -> None:
 
 
 def check_cells(name: str, cells: Any) -> None:
-    """Raise ValueError if a word in a column is longer than the limit of a cell."""
+    """Raise ValueError if a text in a column is longer than the limit of a cell."""
     longest = max((len(cell) for cell in cells if isinstance(cell, str | bytes)), default=0)
     if longest > LONGEST_CELL:
         raise ValueError(
@@ -72,14 +68,10 @@ def check_cells(name: str, cells: Any) -> None:
 def parse_netcdf4(
     file: BinaryIO, path: str, wanted: Mapping[str, Any] | None, bytes_limit: int, numbers_limit: int
 ) -> Any:
-    """Return the attributes and variables of the root group of a NetCDF-4 file, as lists of pairs.
+    """Return the attributes and variables of a NetCDF-4 file's root group, as lists of pairs.
 
-    Args:
-        file: the open file.
-        path: path of the file; unused.
-        wanted: ``names``, in lower case, and ``prefix``: of the variables whose values are read; None: all variables.
-        bytes_limit: of all values together, counted before any is read.
-        numbers_limit: limit of their number.
+    ``wanted`` has the lower-case ``names`` and the ``prefix`` of the variables whose values are read; None: all.
+    Before any is read their bytes, and their number, are checked against the limits.
     """
     import h5netcdf
     import h5py
@@ -137,7 +129,6 @@ def _item_size(variable: Any) -> int:
 
 
 def _check_links(group: Any, h5py: Any) -> None:
-    """Raise ValueError if a variable of an HDF5 group has its values in another file."""
     for name in group:
         link = group.get(name, getlink=True)
         if isinstance(link, h5py.ExternalLink):
@@ -161,14 +152,10 @@ def parse_netcdf4_names(file: BinaryIO, path: str) -> Any:
 def parse_parquet(
     file: BinaryIO, path: str, wanted: Mapping[str, Any], rows_limit: int, bytes_limit: int
 ) -> Any:
-    """Return the names of all columns of a Parquet file, and the wanted columns as arrays, dates or numbered words.
+    """Return the names of all columns in a Parquet file, and the wanted columns as numbers, dates or text indices.
 
-    Args:
-        file: the open file.
-        path: path of the file; unused.
-        wanted: ``names``, in lower case, and ``prefix``, of the columns that are read.
-        rows_limit: of the table.
-        bytes_limit: of these columns unpacked, as the file states.
+    ``wanted`` has the lower-case ``names`` and the ``prefix`` of the columns that are read. ``bytes_limit`` is of
+    these columns unpacked, as the file states.
     """
     import pyarrow
     from pyarrow import parquet
@@ -254,9 +241,9 @@ ONBOARD_FIELDS = ("timestamp", "timestamp_sample", "x", "y", "ref_lat", "ref_lon
 
 
 def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
-    """Return the receiver's positions in a PX4 log (ULog): the topic, the names of its fields, and the known ones.
+    """Return a receiver's positions in a PX4 log (ULog): topic, names of its fields, and known fields as arrays.
 
-    With ``onboard`` the positions of the vehicle's own filter, empty if there are none.
+    With ``onboard`` those of the vehicle's own filter, empty if there are none.
     """
     import pyulog
 
@@ -285,9 +272,9 @@ ORIGINS = {"ORGN": ("TimeUS", "Type", "Lat", "Lng")}
 
 
 def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
-    """Return the first receiver's position fixes in an ArduPilot log, a column each, and their stated errors.
+    """Return the first receiver's fixes in an ArduPilot log, as columns, and their stated errors.
 
-    With ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, empty if there are
+    With ``onboard`` the estimates of the first core of the vehicle's own filter, and their origins; empty if there are
     none.
     """
     import numpy
@@ -318,15 +305,12 @@ POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs
 
 
 class _Bag(NamedTuple):
-    """An open bag, of ROS 1 or 2."""
-
     reader: Any
     parse: Callable[[bytes, str], Any]
     digests: Callable[[str], str] | None
     """Digests of the library's definitions of types; None where a bag contains none."""
 
     def busiest(self, kind: str) -> str:
-        """Return the topic with the most messages of a type; empty if there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:
@@ -334,11 +318,6 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Return the numbers of a topic's messages as columns, since messages need a hundred times the memory.
-
-        Raises:
-            ValueError: if there are none or too many, or they are of another definition.
-        """
         import numpy
 
         chosen = [c for c in self.reader.connections if c.topic == topic and c.msgtype == kind]
@@ -355,7 +334,7 @@ class _Bag(NamedTuple):
 
 
 def _open_bag(path: str) -> _Bag:
-    """Return an open ROS bag with the library's type definitions; those in a bag would be compiled to code."""
+    """Return an open ROS bag with the library's message types; those in a bag would be compiled to code."""
     from rosbags.typesys import Stores, get_typestore
 
     reader: Any
@@ -400,7 +379,7 @@ def _seconds(header: Any) -> float:
 
 
 def _fix_values(fix: Any) -> tuple[float, ...]:
-    """Return the time, status, latitude, longitude, altitude, variances east and north, and their type of a fix."""
+    """Return time, status, latitude, longitude, altitude, variances east and north, and covariance type of a fix."""
     variances = fix.position_covariance.reshape(3, 3).diagonal()
     place = fix.latitude, fix.longitude, fix.altitude
     known = fix.position_covariance_type
@@ -408,7 +387,7 @@ def _fix_values(fix: Any) -> tuple[float, ...]:
 
 
 def _pose_values(message: Any) -> tuple[float, ...]:
-    """Return the time, x, y, and their variances of a pose message; a variance is zero if the file has none."""
+    """Return the time, x, y and their variances of a pose; a variance is zero if the message has none."""
     pose, variances = message.pose, (0.0, 0.0)
     if hasattr(pose, "covariance"):
         diagonal = pose.covariance.reshape(6, 6).diagonal()
@@ -420,7 +399,7 @@ def _pose_values(message: Any) -> tuple[float, ...]:
 
 
 def parse_yaml(file: BinaryIO, path: str) -> Any:
-    """Return the value of a YAML file as words, numbers, lists and mappings, with aliases resolved."""
+    """Return the value in a YAML file as words, numbers, lists and mappings, aliases resolved."""
     import yaml
 
     try:
@@ -478,13 +457,12 @@ class _WithoutPandas:
     """Import hook that hides pandas, whose import by Arrow takes 0.2 s and is not needed."""
 
     def find_spec(self, name: str, *_: Any) -> None:
-        """Raise ImportError for pandas; return None for every other module."""
         if name == "pandas":
             raise ImportError(name)
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Limit this process's further memory, bytes, and processor time, s, and forbid it to write files."""
+    """Limit this process's further memory (bytes) and processor time (s), and forbid it to write files."""
     try:
         import resource
     except ImportError:  # Windows; the parent has reported it
@@ -499,7 +477,7 @@ def _limit(memory: int, seconds: int) -> None:
 
 
 def _plain(value: Any, arrays: list[Any]) -> Any:
-    """Return a value in the types of JSON, and append its arrays, in native byte order, to ``arrays``."""
+    """Return a value in JSON's types; its arrays are appended to ``arrays`` in native byte order."""
     if isinstance(value, dict):
         return {name: _plain(item, arrays) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -534,7 +512,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 
 
 def main() -> None:
-    """Parse the file that the request in the first argument names, and write the result to standard output."""
+    """Parse the file that the request in the program's first argument names; write the result to standard output."""
     request = json.loads(sys.argv[1])
     # Libraries print warnings, so the result has a channel of its own.
     answers = os.dup(1)

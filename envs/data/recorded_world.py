@@ -17,7 +17,7 @@ from ..contract.world import World
 
 
 class Replayed(NamedTuple):
-    """Position of an episode in the tables of a recording: the truth of a replayed world."""
+    """Position of an episode in a recording: the truth of a replayed world."""
 
     number: Array
     """Number of the recording, ``(N,)``, as a float, like all fields below."""
@@ -30,7 +30,7 @@ class Replayed(NamedTuple):
 
 
 class RecordedArrays(NamedTuple):
-    """Arrays of a recording for replay: floats with measurements, or recordings, on the last axis."""
+    """Arrays of a recording for replay, with all measurements, or all recordings, on the last axis."""
 
     measurements: Mapping[str, numpy.ndarray]
     initial: Mapping[str, numpy.ndarray]
@@ -42,7 +42,7 @@ class RecordedArrays(NamedTuple):
 
 
 def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Return an example of the initial estimate and of a measurement of a task, arrays ``(..., 8)``.
+    """Simulate an example of a task's initial estimate and measurement, arrays ``(..., 8)``.
 
     Args:
         task: on NumPy arrays.
@@ -63,12 +63,9 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Return an example of the initial estimate and of a measurement of a task in an open loop.
+    """Simulate an example of a task's initial estimate and measurement; ValueError for a closed loop.
 
     Arguments as of :func:`measure_examples`.
-
-    Raises:
-        ValueError: if the measurements depend on the estimates.
     """
     if task.closes_loop:
         raise ValueError(
@@ -80,7 +77,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
-    """Return nested NamedTuples like ``like`` with other arrays, found by name and converted to the same types.
+    """Return nested NamedTuples like ``like`` with other arrays, looked up by name and converted to its types.
 
     Args:
         like: a measurement, or an initial estimate.
@@ -99,7 +96,7 @@ def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
 
 
 class _ForeignWorld(World[Task, Any, Any]):
-    """World with readings of real sensors in place of a task's simulated world.
+    """World of readings of real sensors; the task's simulated world computes costs and missing values.
 
     Attributes:
         simulated: the task's own world, which computes the cost of an error.
@@ -110,19 +107,15 @@ class _ForeignWorld(World[Task, Any, Any]):
         self.simulated: World[Any, Any, Any] = task.World(task)
 
     def mask_missing(self, measurement: Any) -> Any:
-        """Return the measurement with NaN in place of missing values, as the task's simulated world does."""
         return self.simulated.mask_missing(measurement)
 
     def component_readings(self, measurement: Any) -> Array | None:
-        """Return the readings of the components, ``(C, N)``, as the task's simulated world does."""
         return self.simulated.component_readings(measurement)
 
     def component_deviations(self, measurement: Any) -> Array | None:
-        """Return the stated deviations of :meth:`component_readings`, as the task's simulated world does."""
         return self.simulated.component_deviations(measurement)
 
     def error_cost(self, error: Array) -> Array:
-        """Return the cost of an estimation error by the task's simulated world, ``(N,)``."""
         return self.simulated.error_cost(error)
 
 
@@ -130,8 +123,6 @@ class RecordedWorld(_ForeignWorld):
     """World that replays the readings of a recording.
 
     Args:
-        task: the task.
-        tables: arrays of a recording.
         name: name of the recording, for errors.
     """
 
@@ -155,19 +146,19 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
-        """Return a randomly drawn recording's position and initial estimate for each episode."""
+        """Draw a recording for each episode; return its position at the start and its initial estimate."""
         number = draws.integer("recording", (0, len(self.tables.first) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
         initial = self._fill(self._initial, self.tables.initial, number)
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Return the position at the next measurement, and that measurement; the last one is repeated at the end."""
+        """Return the position at the next measurement, and that measurement; at the end the last one again."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
-        """Return the readings of the components in all measurements and their stated deviations, ``(C, measurements)``.
+        """Return the readings of the components in all measurements, and their deviations, ``(C, measurements)``.
 
         Both are None where the measured quantity is no component.
         """
@@ -178,16 +169,13 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def _column(self, truth: Replayed) -> Array:
-        """Return the index of the current measurement in the tables, ``(N,)``."""
         xp = self.xp
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
     def _at(self, table: Array, column: Array) -> Array:
-        """Return the entries of a table at measurements with these column numbers ``(N,)``, as ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """Return a NamedTuple like ``like`` with the entries of the tables at columns ``(N,)``."""
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
@@ -201,7 +189,7 @@ class RecordedWorld(_ForeignWorld):
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: the time since the start of the track, s."""
+        """Return the value to record at a measurement by name: the time since the track's start, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
@@ -211,12 +199,12 @@ class RecordedWorld(_ForeignWorld):
 
 @dataclass(frozen=True)
 class Feed:
-    """Live measurements in place of a recording; the truth is unknown.
+    """Scenario data of live measurements in place of a recording; their truth is unknown.
 
     Args:
         regular: whether every measurement comes, one sampling interval after the previous one.
         second_sensor: whether a measurement has the fields that only recordings contain.
-        deviations: of measurements that state none, by the names and in the units of the columns of a log.
+        deviations: of measurements that state none, named and in units as in a log.
         scan_interval: time between scans, s; a longer time between two measurements contains missed scans. None: the
             time between is one step.
         origin: origin of the conversion of latitude and longitude into metres; None: they are not accepted.
@@ -231,11 +219,11 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come that many seconds apart; True if the filters do not use times."""
+        """Return True: live measurements are taken to come at a task's constant interval."""
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Return an empty tuple: live measurements have no episodes with a length."""
+        """Return the episodes' lengths: an empty tuple, as live measurements have no end."""
         return ()
 
     def world(self, task: Task) -> "LiveWorld":
@@ -244,14 +232,13 @@ class Feed:
 
 
 class Unknown(NamedTuple):
-    """The unknown truth of live measurements, an empty state."""
+    """The unknown truth of live measurements: an empty state."""
 
 
 class LiveWorld(_ForeignWorld):
-    """World of live measurements: its noise argument contains the numbers of a measurement.
+    """World of live measurements, whose numbers are passed in as its noise.
 
     Args:
-        task: the task.
         second_sensor: whether a measurement has the fields that only recordings contain.
 
     Attributes:
@@ -267,15 +254,14 @@ class LiveWorld(_ForeignWorld):
         self.normals: int = _count_numbers(self.measurement)
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Unknown, Any]:
-        """Return an unknown truth, and the initial estimate made of the numbers in ``normals``."""
+        """Return the unknown truth, and the initial estimate made of the numbers in ``normals``."""
         return Unknown(), self._fill(self.initial, normals)
 
     def advance(self, truth: Unknown, noise: Array, feedback: None) -> tuple[Unknown, Any]:
-        """Return an unknown truth, and the measurement made of the numbers in ``noise``."""
+        """Return the unknown truth, and the measurement made of the numbers in ``noise``."""
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """Return a NamedTuple like ``like`` whose arrays are successive rows of ``numbers``, ``(numbers, N)``."""
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])
@@ -289,5 +275,4 @@ class LiveWorld(_ForeignWorld):
 
 
 def _count_numbers(like: Any) -> int:
-    """Return the number of rows that the arrays of a NamedTuple have in all."""
     return sum(math.prod(array.shape[:-1]) for _, array in named_arrays(like))

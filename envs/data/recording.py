@@ -1,13 +1,10 @@
 """Recorded measurements in place of a simulated world: readings of real sensors, replayed under any policy.
 
-A :class:`Recording` contains episodes of one environment: every array of its ``Measurement``, the initial estimate of
-the start of the track, the times, and the truth where it is known. As a scenario it replaces the task's own world by a
-:class:`.RecordedWorld`: an episode replays one recording, which its first uniform number draws. Banks,
-estimators, backends and evaluations are the same as in a simulation.
+As a scenario a :class:`Recording` replaces the task's own world by a :class:`.RecordedWorld`: an episode replays one
+recording, which its first uniform number draws.
 
-The environment determines the arrays: it measures once, and the recording must have arrays of the same names and
-shapes. So this module is the same for every task whose measurements do not depend on the estimates. In a closed
-loop they do, and no recording has the readings that another estimate would have caused.
+The recording must have arrays of the same names and shapes as one simulated measurement. A task with a closed loop has
+no recordings: none has the readings that another estimate would have caused.
 
 Without truth there are no errors and no costs, and rewards are zero.
 """
@@ -33,7 +30,7 @@ from .scenario_data import ScenarioData
 
 @dataclass(frozen=True, eq=False)
 class Recording(ScenarioData):
-    """Recorded episodes of one environment, E of them; the longest has T measurements.
+    """Recorded measurements of one environment in E episodes; the longest has T measurements.
 
     Args:
         environment: id of the environment.
@@ -110,7 +107,6 @@ class Recording(ScenarioData):
             self._check_episode(episode, int(rows[episode]), name)
 
     def _check_episode(self, episode: int, rows: int, name: str) -> None:
-        """Raise ValueError if an episode cannot be replayed."""
         if not 1 <= self.lengths[episode] <= rows:
             raise ValueError(
                 f"recording {name!r}: length must be from 1 to its {rows} measurements, got {self.lengths[episode]}"
@@ -137,7 +133,6 @@ class Recording(ScenarioData):
                 raise ValueError(f"recording {name!r}: initial_{what} is not finite")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
-        """Return the recording itself, which is immutable."""
         return self
 
     def __repr__(self) -> str:
@@ -153,10 +148,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def truth_known(self) -> numpy.ndarray:
-        """Return whether the truth of each component is known somewhere in every episode, booleans ``(C,)``.
-
-        The truth must not be None.
-        """
+        """For each component whether every episode has a true value of it, ``(C,)``; ``truth`` must not be None."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         truth: Any = self.truth
         known: numpy.ndarray = numpy.logical_and(numpy.isfinite(truth), there[..., None]).any(axis=1)
@@ -171,7 +163,7 @@ class Recording(ScenarioData):
         return bool(numpy.isfinite(self.truth[there]).all())
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come that many seconds apart, counted from the start of the track."""
+        """Return whether measurements come this many seconds apart, counted from the start of the track."""
         times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
         late = numpy.abs(self.seconds - times)
         # NaN beyond the end of a shorter episode. Times in a file are rounded.
@@ -184,12 +176,12 @@ class Recording(ScenarioData):
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Return the number of measurements acted on in each episode: whole decisions, none beyond the horizon."""
+        """Return the number of measurements acted on in each episode: whole decisions within the horizon."""
         lengths = numpy.minimum(self.lengths, horizon)
         return tuple((lengths - lengths % decision_interval).tolist())
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Return a scenario in which every episode replays one recorded episode.
+        """Return a scenario of an environment in which every episode replays one recorded episode.
 
         Args:
             cls: the environment.
@@ -274,7 +266,6 @@ class Recording(ScenarioData):
             self._check_cost_known(task)
 
     def _check_cost_known(self, task: Task) -> None:
-        """Raise ValueError if the known part of an episode's truth does not determine the cost of an error."""
         world, rows = task.World(task), self.rows
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
@@ -295,7 +286,7 @@ class Recording(ScenarioData):
 
     @property
     def dataset(self) -> Any:
-        """Return the recording as an :class:`xarray.Dataset`, the content of its file."""
+        """The recording as an :class:`xarray.Dataset`, the content of its file."""
         return _dataset_of(self)
 
     def write(self, path: Any) -> None:
@@ -305,12 +296,12 @@ class Recording(ScenarioData):
     # --- as a world
 
     def world(self, task: Task) -> RecordedWorld:
-        """Return the world of a task that replays this recording."""
+        """Return the world that replays this recording, for a task."""
         return RecordedWorld(task, self.tables, self.name)
 
     @functools.cached_property
     def tables(self) -> RecordedArrays:
-        """Arrays of all recorded episodes, concatenated along the last axis, as floats."""
+        """Arrays of all recorded episodes for replay, joined along the last axis, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
 
@@ -331,7 +322,6 @@ class Recording(ScenarioData):
 
 
 def _dataset_of(recording: Recording) -> Any:
-    """Return a recording as an :class:`xarray.Dataset`, the content of its file."""
     import xarray
 
     there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
@@ -405,12 +395,9 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
 
 
 def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
-    """Return one recording with the episodes of several that have the parameters of the first; omit the others.
+    """Join recordings with the parameters of the first into one recording; the others are omitted.
 
-    Args:
-        recordings: at least one.
-        name: name of the result.
-        notes: remarks on the reading, a line each; omissions are added.
+    ``notes`` are remarks on the reading, a line each; omissions are added.
     """
     first, lines = recordings[0], list(notes)
     kept: list[Recording] = []
@@ -439,15 +426,13 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
     for one in kept:
         alone = len(one.names) == 1
         names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
-    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
+    return stack_recordings(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
 
 
-def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
-    """Return one recording with the episodes of several, padded to the same length.
+def stack_recordings(recordings: Sequence[Recording], **fields: Any) -> Recording:
+    """Join recordings into one that has all their episodes, padded to the same length.
 
-    Args:
-        recordings: at least one; the truth is known if it is known in all.
-        **fields: fields of the result that differ from those of the first.
+    The truth is known where all have one. ``fields`` are those of the result that differ from the first recording's.
     """
     first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
 
@@ -480,12 +465,11 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Return the index of the first row of an array that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
 def changed_parameters(parameters: Any) -> dict[str, Any]:
-    """Return the parameters of a task that differ from their defaults by name, without the horizon."""
+    """Return the parameters of a task that differ from their defaults, by name, without the horizon."""
     found = {}
     for each in dataclasses.fields(parameters):
         value = getattr(parameters, each.name)

@@ -9,10 +9,10 @@ from ..contract.task import Scenario, Task
 
 
 class ScenarioData:
-    """Base class of data from which an environment makes a scenario."""
+    """Base class of data from which an environment makes a scenario, such as flights or a recording."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Return a scenario of an environment made from the data.
+        """Return the scenario that an environment makes of the data; subclasses define it.
 
         Args:
             cls: the environment.
@@ -24,12 +24,12 @@ class ScenarioData:
         raise NotImplementedError
 
     def fields(self) -> dict[str, Any]:
-        """Return the constructor's arguments by name; this dictionary is also a valid scenario."""
+        """Return the constructor's arguments by name, also a valid scenario; subclasses define it."""
         raise NotImplementedError
 
 
 class FlightData(ScenarioData):
-    """Base class of flights, of which every episode of a scenario flies one."""
+    """Base class of flight data: every episode of a scenario flies one flight."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
         """Return a scenario of an environment in which every episode flies one of the flights."""
@@ -41,7 +41,7 @@ class FlightData(ScenarioData):
 
 
 class Reader(NamedTuple):
-    """Functions that recognise and read one kind of data in files, folders or dictionaries."""
+    """Functions that recognise and read one kind of scenario data, such as flights."""
 
     takes: Callable[[Any], bool]
     """Function that returns whether a value, not the name of a scenario, names or contains data of this kind."""

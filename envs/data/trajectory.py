@@ -15,7 +15,7 @@ MOST_SAMPLES = 20_000
 
 @dataclass(frozen=True)
 class Trajectory(FlightData):
-    """Positions and velocities of a flight at given times.
+    """Positions and velocities of one flight at given times.
 
     Args:
         time: seconds, strictly increasing, ``(n,)`` with n >= 2.
@@ -68,11 +68,7 @@ class Trajectory(FlightData):
         return float(self.time[-1] - self.time[0])
 
     def intervals(self, interval: float) -> int:
-        """Return the number of whole sampling intervals (s) within the flight.
-
-        Raises:
-            ValueError: if they are too many for an episode.
-        """
+        """Return the number of whole sampling intervals (s) in the flight; ValueError if too many for an episode."""
         count = self.duration / interval + 1e-9
         if count > MOST_SAMPLES:
             raise ValueError(
@@ -83,15 +79,12 @@ class Trajectory(FlightData):
         return int(count)
 
     def resample(self, interval: float, count: int) -> numpy.ndarray:
-        """Return position and velocity, ``(4, count)``, at ``count`` times ``interval`` (s) apart from the start on.
+        """Return x, y (m) and their rates, ``(4, count)``, at times ``interval`` (s) apart from the start on.
 
         The flight continues straight beyond its end.
 
         Between the given times a cubic runs through positions and velocities (Hermite), or, without
         velocities, a cubic spline through the positions.
-
-        Returns:
-            x, y (m) and their rates (m/s), ``(4, count)``.
 
         Raises:
             ValueError: for too many samples.

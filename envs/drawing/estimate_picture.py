@@ -27,10 +27,9 @@ ELLIPSE_SIGMAS = 2.0
 
 
 class EstimatePicture(Picture):
-    """Truth, readings and estimate, in a plane where two components are one; errors with their reported bands.
+    """Picture of truth, readings and estimate, in a plane if there is one, and of errors with reported bands.
 
     Args:
-        model: of the episodes.
         track: arrays of the whole episode, for constant limits, see :meth:`values`.
     """
 
@@ -49,7 +48,7 @@ class EstimatePicture(Picture):
         self.limits: list[tuple[float, float]] = [_extent(path[:, i]) for i in self.drawn]
 
     def values(self, track: Mapping[str, numpy.ndarray], k: int) -> dict[str, float]:
-        """Return the values of one measurement that the history of the picture stores, by series name.
+        """Return the values of one measurement by series name, for the picture's history.
 
         Args:
             track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
@@ -68,7 +67,7 @@ class EstimatePicture(Picture):
         return values
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series of the errors of the first components."""
+        """Return the time series of the picture: errors of the first components."""
         return [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in self.task.components[:MOST_STRIPS]
@@ -116,7 +115,7 @@ class EstimatePicture(Picture):
         )
 
     def arrange(self) -> None:
-        """Set the axis limits to the whole path."""
+        """Set the axis limits of the picture to the whole path."""
         if not self.plane:
             self.panel.set_xlim(0.5, self.task.horizon + 0.5)
             self.panel.set_ylim(*self.limits[0])
@@ -149,12 +148,10 @@ class EstimatePicture(Picture):
             self.ellipse.set_angle(float(numpy.degrees(numpy.arctan2(directions[1, 1], directions[0, 1]))))
 
     def _places(self, values: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the coordinates of values in the panel: in the plane, or over time."""
         return (values[0], values[1]) if self.plane else (numpy.arange(1, len(values[0]) + 1), values[0])
 
 
 def _extent(values: numpy.ndarray) -> tuple[float, float]:
-    """Return the lowest and highest of some values, with a margin, as axis limits."""
     finite = values[numpy.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     margin = MARGIN * (high - low) or 1.0

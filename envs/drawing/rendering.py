@@ -1,9 +1,8 @@
 """Pictures of a running episode, for ``render_mode`` "rgb_array" and "human".
 
-An :class:`EpisodePicture` stores the history of one episode and draws it into one figure, whose axes never
-move. A :class:`Picture` determines the content: that of the problem's :class:`~.companions.PictureMaker`, or, without
-one, the base class, which can draw every task: errors with the band that the estimator reports, actions,
-observations.
+An :class:`EpisodePicture` stores the history of one episode and draws it into one figure. A :class:`Picture`
+determines the content: that of the problem's :class:`~.companions.PictureMaker`, or the base class, which can draw
+every task.
 
 Pictures show the truth, also that of the scans to come (the limits of the axes, marked manoeuvres). An agent
 observes none of it.
@@ -58,7 +57,7 @@ History = Mapping[str, numpy.ndarray]
 
 
 class Strip(NamedTuple):
-    """Panel of curves over the number of the measurement (time series)."""
+    """Panel of curves over the number of the measurement (a time series)."""
 
     title: str
     """Title, with the unit."""
@@ -75,16 +74,14 @@ class Strip(NamedTuple):
 
 
 def error_strip(title: str, component: str, limit: float) -> Strip:
-    """Return the time-series panel of a component's error with its reported band, initially within plus and minus
-    ``limit``.
-    """
+    """Return the time-series panel of a component's error with its reported band; its limits begin at +-``limit``."""
     return Strip(
         title, {"error": f"error.{component}"}, (-limit, limit), band=f"sigma.{component}", guides=(0.0,)
     )
 
 
 def widen_limits(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """Return limits stretched about zero by the smallest factor 1, 2, 5, 10, ... that contain low and high."""
+    """Return axis limits widened about zero by a factor of 1, 2, 5, 10, ... until they contain low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
@@ -101,10 +98,10 @@ def widen_limits(limits: tuple[float, float], low: float, high: float) -> tuple[
 
 
 class Picture:
-    """Picture of an episode; this base class draws any task.
+    """Picture of an episode; this base class draws errors, actions and observations of any task.
 
-    A subclass declares its additions to the history (:meth:`records`) and the time series to draw (:meth:`strips`), and
-    may draw further panels into the figure's left part (:meth:`open`, :meth:`begin`, :meth:`draw`).
+    A subclass declares additions to the history (:meth:`records`) and time series (:meth:`strips`), and may draw
+    further panels into the figure's left part (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
     Args:
         model: of the episodes; its states contain lane 0 of a batch that is padded to several.
@@ -124,11 +121,11 @@ class Picture:
         self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
-        """Return further values of a state after the action for the history, beside errors, sigmas and actions."""
+        """Return further values for the history, beside errors, sigmas and actions, by name; by default none."""
         return {}
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series to draw: the error of every component with its reported band, and the action."""
+        """Return the time series of the picture: the error of each component with its reported band, and the action."""
         shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
@@ -147,28 +144,26 @@ class Picture:
         return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
-        """Return whether the last panel shows every component of the observation as a colour."""
+        """Return whether the picture's last panel shows the observation as colours; by default True."""
         return True
 
     def open(self, figure: Figure) -> None:
-        """Create the panels that a subclass draws beside the time series; called once for a figure."""
+        """Create the panels that a subclass draws beside the time series, once for a figure; by default none."""
 
     def begin(self, state: Any) -> None:
-        """Prepare the picture for a new episode, given the state after the first measurement; by default do nothing."""
+        """Prepare the picture for a new episode, whose first measurement has arrived; by default do nothing."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return intervals of measurements, first and last, that every time series shades grey."""
+        """Return intervals of measurements that every time series shades grey, first and last; by default none."""
         return ()
 
     def arrange(self) -> None:
-        """Set axis limits for the episode of :meth:`begin`; called before its first drawing."""
+        """Set the picture's axis limits for a new episode, before its first drawing; by default do nothing."""
 
     def draw(self, history: History, state: Any) -> None:
-        """Update the panels of :meth:`open` to the current measurement.
+        """Update the panels of :meth:`open` to the current measurement; by default do nothing.
 
-        Args:
-            history: of the measurements acted on.
-            state: after the last measurement, which is not yet acted on.
+        ``history`` is of the measurements acted on; ``state`` is after the last measurement, not yet acted on.
         """
 
 
@@ -178,8 +173,6 @@ def picture_of(model: Model) -> Picture:
 
 
 class _StripPanel:
-    """Axes and artists of one time series."""
-
     def __init__(self, axes: Axes, strip: Strip) -> None:
         self.axes, self.strip = axes, strip
         axes.set_title(strip.title, loc="left", fontsize=9, pad=4)
@@ -231,7 +224,7 @@ class _StripPanel:
 
 
 class _ObservationPanel:
-    """The observation as colours: one row for each component."""
+    """Panel of the observation as colours, one row for each component."""
 
     def __init__(self, axes: Axes, fields: int, horizon: int) -> None:
         self.axes = axes
@@ -257,11 +250,9 @@ _FIGURE = (*_NO_FIGURE, "_title", "_panels", "_observation", "_shades")
 
 
 class EpisodePicture:
-    """History and picture of one episode.
+    """History and picture of one running episode.
 
     Args:
-        model: of the episode.
-        scenario: name of the scenario, for the title.
         mode: "rgb_array" or "human".
         frames_per_second: largest frame rate of a window.
         picture: content; default: the picture of the model's task, or the general one.
@@ -300,7 +291,6 @@ class EpisodePicture:
             self._go_on_unseen(problem)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all attributes except the figure, for pickling."""
         picture = copy.copy(self.picture)
         for name in self._artists & vars(picture).keys():
             delattr(picture, name)
@@ -310,18 +300,15 @@ class EpisodePicture:
     # --- history
 
     def begin(self, state: Any) -> None:
-        """Delete the history and start a new episode, from its state after the first measurement."""
+        """Delete the picture's history and start a new episode, whose first measurement has arrived."""
         self.history, self.observations, self.count = {}, [], 0
         self.picture.begin(state)
         self._fresh = True
 
     def keep(self, state: Any, action: numpy.ndarray, observation: numpy.ndarray) -> None:
-        """Append a measurement, its action and observation to the history.
+        """Append a measurement, the action and the observation before it to the picture's history.
 
-        Args:
-            state: after the action; lane 0 is stored.
-            action: the applied action, ``(A,)`` or a scalar.
-            observation: the observation before the action, ``(len(model.fields),)``.
+        ``state`` is after the action, of which lane 0 is stored; ``observation``, ``(fields,)``, is before it.
         """
         nothing = numpy.full(len(self.model.task.components), numpy.nan)
         error = self.model.error(state)[:, 0] if self.model.task.has_truth else nothing
@@ -338,11 +325,7 @@ class EpisodePicture:
         self.append(values)
 
     def append(self, values: Mapping[str, float]) -> None:
-        """Append the values of a measurement to the history.
-
-        Args:
-            values: by the names of the series.
-        """
+        """Append the values of a measurement, by series name, to the picture's history."""
         for name, value in values.items():
             self.history.setdefault(name, []).append(float(value))
         self.count += 1
@@ -350,7 +333,7 @@ class EpisodePicture:
     # --- drawing
 
     def frame(self, state: Any) -> numpy.ndarray:
-        """Return an image of the episode, ``(height, width, 3)`` bytes."""
+        """Return the picture of the episode as an image, ``(height, width, 3)`` bytes."""
         figure = self._draw(state)
         canvas = figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
@@ -370,7 +353,7 @@ class EpisodePicture:
         return numpy.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def show(self, state: Any) -> None:
-        """Draw into the window, at most ``frames_per_second`` times a second; without a window, do nothing."""
+        """Draw the picture into its window, at most ``frames_per_second`` times a second; do nothing without one."""
         if self._unseen:
             return
         from matplotlib import pyplot
@@ -418,7 +401,7 @@ class EpisodePicture:
 
     @property
     def title(self) -> str:
-        """Title: environment, scenario, control and the number of the last measurement acted on."""
+        """Title of the picture: environment, scenario, control, number of the last measurement acted on."""
         name = self.model.task.id.rpartition("/")[2]
         control = [f"control {self.model.control}"] if self.picture.steered else []
         parts = [name, f"scenario {self.scenario}", *control]
@@ -462,7 +445,6 @@ class EpisodePicture:
         return figure
 
     def _arrange(self) -> None:
-        """Set the axis limits of all panels for a new episode."""
         self._fresh = False
         for shade in self._shades:
             shade.remove()
@@ -480,8 +462,6 @@ class EpisodePictures:
 
     Args:
         model: of the episodes, on any backend.
-        scenario: name of the scenario.
-        count: number of episodes.
         frames_per_second: frame rate of a video.
     """
 
@@ -497,25 +477,22 @@ class EpisodePictures:
             picture.caption = f"sub-environment {i}"
 
     def begin(self, state: Any, lanes: Sequence[int]) -> None:
-        """Start new episodes in some lanes, from the state after their first measurement."""
+        """Start new episodes in some lanes (parallel episodes) of the pictures, after their first measurement."""
         for i, picture in enumerate(self.pictures):
             if i in lanes:
-                picture.begin(_alone(state, i))
+                picture.begin(_single_lane(state, i))
 
     def keep(self, state: Any, actions: numpy.ndarray, observations: numpy.ndarray) -> None:
-        """Append a measurement, its actions and observations to the histories.
+        """Append a measurement, actions and the observations before them to the histories of the pictures.
 
-        Args:
-            state: of all episodes after the action.
-            actions: the applied actions, ``(count, ...)``.
-            observations: those before the actions, ``(count, len(model.fields))``.
+        ``state`` is that of all episodes after the actions; ``observations``, ``(count, fields)``, are before them.
         """
         for i, picture in enumerate(self.pictures):
-            picture.keep(_alone(state, i), actions[i], observations[i].copy())
+            picture.keep(_single_lane(state, i), actions[i], observations[i].copy())
 
     def frames(self, state: Any) -> tuple[numpy.ndarray, ...]:
         """Return an image for each episode, ``(height, width, 3)``, the same blank one beyond the first few."""
-        drawn = [picture.frame(_alone(state, i)) for i, picture in enumerate(self.pictures)]
+        drawn = [picture.frame(_single_lane(state, i)) for i, picture in enumerate(self.pictures)]
         return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
 
     def close(self) -> None:
@@ -524,13 +501,12 @@ class EpisodePictures:
             picture.close()
 
 
-def _alone(state: Any, lane: int) -> Any:
-    """Return the episode of one lane on the host, padded with copies of itself, for a picture."""
+def _single_lane(state: Any, lane: int) -> Any:
+    """Return the episode of one lane (parallel episode) on the CPU, padded with copies, for a picture."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:
-    """Return all artists inside the axes, in the order of drawing."""
     return sorted(
         [*axes.images, *axes.collections, *axes.patches, *axes.lines], key=lambda artist: artist.get_zorder()
     )
@@ -541,7 +517,7 @@ class _WindowError(Exception):
 
 
 def _missing_display() -> str:
-    """Return the reason why matplotlib cannot open a window, and the remedy; empty if none is known."""
+    """Return why matplotlib cannot open a window, and the remedy; empty if no reason is known."""
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:

@@ -27,7 +27,7 @@ def make_model(
     threads: int = 1,
     **keywords: Any,
 ) -> Model:
-    """Return a :class:`Model` of a task under a control, on the chosen backend (``model.backend`` names it).
+    """Return the :class:`Model` of a task with one of its controls, on the chosen backend.
 
     Args:
         cls: the task.
@@ -36,7 +36,7 @@ def make_model(
         backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
             traced, else NumPy.
         device: of torch, such as "cuda:1".
-        threads: number of threads for the lanes of the compiled backend.
+        threads: number of threads of the compiled backend.
         **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
 
     Raises:
@@ -64,14 +64,9 @@ def make_model(
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
     """Return the array namespace (NumPy or torch) and the device of a backend.
 
-    Torch is imported only for its own backend.
-
     Args:
         backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
-        device: None for the backend's default (the CPU), or an argument of ``torch.device``, such as "cuda:1".
-
-    Returns:
-        Namespace and device; the device is None for NumPy.
+        device: argument of ``torch.device``, such as "cuda:1"; None: the default (the CPU).
 
     Raises:
         ValueError: for an unknown backend, a device that NumPy does not have, or a device that is not there.

@@ -33,7 +33,7 @@ USER_TASKS: dict[str, "type[Task]"] = {}
 
 
 class Catalogue(Mapping[str, "type[Task]"]):
-    """Mapping of every environment's Gymnasium id to its task class, which is imported on access."""
+    """Mapping of every environment's Gymnasium id to its task class, imported on access."""
 
     def __getitem__(self, id: str) -> "type[Task]":
         folder = folders().get(id)
@@ -53,13 +53,13 @@ class Catalogue(Mapping[str, "type[Task]"]):
 
 
 def catalogue() -> Mapping[str, "type[Task]"]:
-    """Return the mapping of every environment's Gymnasium id to its task class, which is imported on access."""
+    """Return the :class:`Catalogue` of all environments: Gymnasium id to task class."""
     return Catalogue()
 
 
 @functools.cache
 def folders() -> dict[str, str]:
-    """Return the folder name of every environment of this package, by Gymnasium id, without importing tasks."""
+    """Return the folder name of every environment of this package by Gymnasium id, without importing tasks."""
     names = [m.name for m in pkgutil.iter_modules(importlib.import_module(ENVS).__path__) if m.ispkg]
     packages = {name: importlib.import_module(f"{ENVS}.{name}") for name in names}
     return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
@@ -74,7 +74,7 @@ class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes 
 
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
-    """Return a ValueError for an unknown name that suggests the most similar valid ones."""
+    """Return a ValueError for an unknown name, which suggests the most similar valid ones."""
     return ValueError(f"unknown {kind} {quote_shortened(name)}: {_meant(name, valid)}")
 
 
@@ -94,7 +94,7 @@ FOUND_IN: list[str] = []
 
 @contextmanager
 def modules_from(folder: str) -> Iterator[None]:
-    """Context manager: let :func:`import_user_module` search a folder too, and no other import."""
+    """Context manager: :func:`import_user_module` searches this folder too."""
     _SEARCH_FOLDERS.append(folder)
     try:
         yield
@@ -105,7 +105,7 @@ def modules_from(folder: str) -> Iterator[None]:
 
 @contextmanager
 def on_path(folders: Iterable[str]) -> Iterator[None]:
-    """Context manager: append folders to ``sys.path``, after the libraries, and remove them at the end."""
+    """Context manager: append folders to ``sys.path``, after the libraries."""
     further = [folder for folder in folders if folder not in sys.path]
     sys.path.extend(further)
     try:
@@ -115,10 +115,10 @@ def on_path(folders: Iterable[str]) -> Iterator[None]:
 
 
 def import_user_module(module: str, refusal: str) -> ModuleType:
-    """Import and return a module whose name a user gave; the only function that imports by name.
+    """Import and return a module whose name a user gave.
 
-    It is called only for arguments of the command line or of a function that the user calls. Names read from a file go
-    through :func:`task_class`, which imports nothing.
+    No other function imports by name. It is called only for arguments of the command line or of a function that the
+    user calls; names in files go through :func:`task_class`, which imports nothing.
 
     Args:
         module: its name, with dots.
@@ -146,11 +146,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
 
 
 def find_user_module(module: str, refusal: str) -> Path:
-    """Return the path of a module's file whose name a user gave, without importing it.
-
-    Args:
-        module: its name, without dots.
-        refusal: beginning of the error.
+    """Return the path of the file of a module whose name a user gave, without importing it.
 
     Raises:
         ValueError: if there is no such file.
@@ -163,9 +159,7 @@ def find_user_module(module: str, refusal: str) -> Path:
 
 
 def import_task(id: str) -> "type[Task]":
-    """Return the task class of an environment id; for ``module:id``, import that module first.
-
-    The module registers the environment, as for ``gymnasium.make``.
+    """Return the task class of an environment's id; for ``module:id`` import that module first, which registers it.
 
     Raises:
         ValueError: if there is none, or its module cannot be imported.
@@ -183,7 +177,7 @@ def import_task(id: str) -> "type[Task]":
 
 
 def task_class(id: str) -> "type[Task]":
-    """Return the task class of a registered environment id, without imports; ``filtergym/`` may be omitted.
+    """Return the task class of a registered environment's id, without imports; ``filtergym/`` may be omitted.
 
     Raises:
         ValueError: if there is none; of ``module:id``, if the module has not been imported.
@@ -206,10 +200,9 @@ def task_class(id: str) -> "type[Task]":
 
 
 class ImportableName(str):
-    """Id of an environment with the module that registers it, ``module:id``, in this process.
+    """Id of an environment with the module that registers it, ``module:id``, which imports it on unpickling.
 
-    Sent to another process of ours, where it is unpickled, it imports the module. Written to a file and read again it
-    is an ordinary string, which imports nothing.
+    Written to a file and read again it is an ordinary string, which imports nothing.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -224,7 +217,7 @@ def _import_name(name: str) -> ImportableName:
 
 
 def importable_name(cls: "type[Task]") -> str:
-    """Return an environment's id for another process; a user's environment gets its module, ``module:id``."""
+    """Return an environment's id for another process; for a user's environment ``module:id``."""
     return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
 
 
@@ -234,22 +227,19 @@ def short_name(id: str) -> str:
 
 
 def bare_name(id: str) -> str:
-    """Return a Gymnasium id without its namespace and the version ``-v0``, for tables and pages."""
+    """Return a Gymnasium id without namespace and version ``-v0``, for tables and pages."""
     return id.rpartition("/")[2].removesuffix("-v0")
 
 
 def parameter_names(cls: "type[Task]") -> list[str]:
-    """Return the names of an environment's parameters, which are keywords of ``gym.make``, as a list."""
+    """Return the names of an environment's parameters, which are keywords of ``gym.make``."""
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 
 def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str] = ()) -> None:
-    """Raise :class:`UnknownKeyword` if a keyword is not the name of an environment's parameter.
+    """Raise :class:`UnknownKeyword` if a keyword is not the name of a parameter of an environment.
 
-    Args:
-        cls: the environment.
-        keywords: that were given as parameters.
-        others: further valid names, for the suggestion.
+    ``others`` are further valid names, to suggest.
     """
     known = parameter_names(cls)
     for name in keywords:

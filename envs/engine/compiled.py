@@ -25,7 +25,7 @@ from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, start_f
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a method of :class:`CompiledModel` that runs the traced method as native code (decorator)."""
+    """Return a method of :class:`CompiledModel` that runs as native code (decorator)."""
 
     @functools.wraps(method)
     def run(self: "CompiledModel", episode: Episode) -> Any:
@@ -35,11 +35,9 @@ def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class CompiledModel(Model):
-    """A model whose methods run as native code.
+    """A model whose methods run as native code, traced and compiled once.
 
     Args:
-        task: on NumPy arrays.
-        control: name of a control.
         threads: number of threads for the lanes.
 
     Raises:
@@ -85,11 +83,7 @@ class CompiledModel(Model):
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "CompiledModel":
         """Return a compiled model of the same task with another filter in place of the bank.
 
-        Args:
-            make: makes the filter for a model, on NumPy's arrays and on traced ones.
-
-        Raises:
-            NotTraceable: if the filter is no straight line of arithmetic, and does not declare it.
+        ``make`` must work on NumPy arrays and on traced ones.
         """
         other = copy.copy(self)
         other._plain = self._plain.with_filter(make)
@@ -130,12 +124,12 @@ class CompiledModel(Model):
         return self.run(Model.feedback, state, measurement)
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Return N episodes at the start of the track, from their random numbers."""
+        """Return N episodes at the start of the track, made from random numbers."""
         truth, initial = self.run(begin_world, uniforms, normals)
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock)."""
+        """Return the episodes at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock)."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -144,12 +138,7 @@ class CompiledModel(Model):
 def compiled_model(
     cls: type[Task], parameters: Any, control: str, recording: Any = None, threads: int = 1
 ) -> CompiledModel:
-    """Return the compiled model of a task with these parameters, from a cache of the most recent ones.
-
-    Raises:
-        NotTraceable: if a step is no straight line of arithmetic.
-        ImportError: without llvmlite.
-    """
+    """Return the :class:`CompiledModel` of a task with these parameters, from a cache of the most recent ones."""
     make = _make_once if _hashes(parameters) else _make
     return make(cls, parameters, control, recording, threads)
 
@@ -196,12 +185,12 @@ def warn_not_compiled(what: str, error: BaseException) -> None:
 
 
 def share_world(model: Any, other: Any) -> bool:
-    """Return whether two compiled models have the same task and neither filter has feedback to its world."""
+    """Return whether two compiled models can share a simulated world: one task, and no feedback of either filter."""
     return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
 
 
 def can_step(model: Any, report: Report) -> bool:
-    """Return whether a model is compiled and a report function on its steps can be compiled as well."""
+    """Return whether native code can step a model: it is compiled, and so can be this report on its steps."""
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:

@@ -2,11 +2,10 @@
 
 When an episode starts, its lane's generator gives its *identity*, two whole numbers of 64 bits. Every random number of
 the episode is a function of its identity, the measurement ``t`` and the number's place in the measurement
-(:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement
-``t``. So earlier episodes, actions, the control, other lanes, copies and threads do not change them: policies of
-different controls that start from the same seed have the same noise.
+(:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement ``t``. So
+policies of different controls that start from the same seed have the same noise.
 
-With llvmlite compiled code makes the numbers, otherwise NumPy, for many measurements at once; the bits are the same.
+Compiled code and NumPy make the same bits.
 """
 
 import copy
@@ -31,7 +30,7 @@ BLOCKS_OF_SEEDS = 64
 
 
 def draw_identity(generator: numpy.random.Generator) -> numpy.ndarray:
-    """Return the identity of a new episode: two random 64-bit integers, ``(2,)`` uint64."""
+    """Draw the identity of a new episode: two random 64-bit integers, ``(2,)`` uint64."""
     # The generator's raw words: its methods take ten times longer for the same numbers.
     found: numpy.ndarray = generator.bit_generator.random_raw(2)
     return found
@@ -47,22 +46,17 @@ def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
 
 
 def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
-    """Return the identities, ``(2, N)`` uint64, of the first episodes after a reset with each of N seeds.
+    """Return the identities ``(2, N)`` of the episodes that resets with N seeds start.
 
-    Seeding a generator is slow, and competitors are compared on the same seeds, so the identities of the last blocks
-    of seeds are stored.
+    Seeding a generator is slow, so the identities of the last blocks of seeds are cached.
     """
     return _identities_of_seeds(tuple(seeds))
 
 
 def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the uniform and the standard normal numbers with which episodes of these identities start.
+    """Return the uniform and normal numbers at the start of the episodes with these identities.
 
     Their shapes are ``(layout.uniforms, N)`` and ``(layout.initial_normals, N)``.
-
-    Args:
-        identities: ``(2, N)`` uint64.
-        layout: of the task.
     """
     t = numpy.zeros(identities.shape[1], dtype=numpy.int64)
     found = numbers(identities, t, layout.initial_normals, layout.uniforms)
@@ -70,20 +64,14 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
 
 
 def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
-    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of N seeds.
-
-    Args:
-        seeds: as in :func:`identities_of_seeds`.
-        layout: of the task.
-    """
+    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of N seeds."""
     return start_numbers(identities_of_seeds(seeds), layout)[0]
 
 
 class EpisodeNoise:
-    """Random numbers of the episodes in ``count`` lanes (parallel episodes).
+    """Random numbers of the running episodes in ``count`` lanes (parallel episodes).
 
     Args:
-        task: source of layout and namespace.
         count: number of lanes; they are padded to a multiple of eight by episodes of identity zero.
 
     Attributes:
@@ -106,7 +94,6 @@ class EpisodeNoise:
         self._forget()
 
     def _forget(self) -> None:
-        """Delete the cached values derived from identities and measurements."""
         self._next: Call | None = None
         self._due = False
         """Whether the numbers of the current measurement are still to be made."""
@@ -118,39 +105,35 @@ class EpisodeNoise:
     # --- which episodes
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Set the generator that draws the identities of a lane's next episodes."""
+        """Set the random generator that draws the identities of a lane's next episodes."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
 
     def draw_identities(self, lanes: Sequence[int]) -> numpy.ndarray:
-        """Draw the identities of new episodes in some lanes, ``(2, lanes)``, with the lanes' generators."""
+        """Draw the identities ``(2, lanes)`` of new episodes in some lanes."""
         generators = self.generators
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
-    def put(self, identities: numpy.ndarray) -> None:
-        """Place episodes of these identities, ``(2, lanes)``, into the first lanes, before their start.
-
-        The other lanes are padding.
-        """
+    def set_identities(self, identities: numpy.ndarray) -> None:
+        """Set new episodes with these identities, ``(2, lanes)``, into the first lanes; the others are padding."""
         self.identities[:, : identities.shape[1]] = identities
         self.identities[:, identities.shape[1] :] = 0
         self.measurement[:] = -1
         self._ahead, self._row, self._due = None, None, False
 
     def start_call(self, memory: numpy.ndarray) -> Call:
-        """Return the native call that computes the random numbers of the episodes' start after :meth:`put`.
+        """Return the native call that writes the random numbers of the episodes' start, after :meth:`set_identities`.
 
-        Args:
-            memory: for normals and uniforms, ``(initial_normals + uniforms, width)``.
+        They are written to ``memory``, ``(initial_normals + uniforms, width)``.
         """
         return bind_numbers(self.identities, self.measurement, memory, self._layout.initial_normals)
 
     def start(self) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the random numbers of the episodes' start after :meth:`put`, and advance to the first measurement.
+        """Return the uniform and normal numbers of the episodes' start, and advance to the first measurement.
 
         Returns:
-            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, in new memory.
+            Arrays ``(uniforms, width)`` and ``(initial_normals, width)``, in new memory.
         """
         self._due = True
         if not AVAILABLE:
@@ -161,8 +144,8 @@ class EpisodeNoise:
         self.start_call(memory)(0, self.width)
         return memory[normals:], memory[:normals]
 
-    def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
-        """Replace the episodes in some lanes by the first episodes of another object."""
+    def replace_episodes(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
+        """Replace the episodes in some lanes by the first episodes of another :class:`EpisodeNoise`."""
         self.identities[:, lanes] = other.identities[:, : len(lanes)]
         self.measurement[lanes] = other.measurement[: len(lanes)]
         if self._ahead is not None:
@@ -184,7 +167,7 @@ class EpisodeNoise:
             self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
         return self._row
 
-    def call_of_each(self) -> Call:
+    def next_measurement_call(self) -> Call:
         """Return the native call that advances to the next measurement and writes its numbers at :attr:`address`.
 
         It is for native code over several measurements, which runs it at least once.
@@ -196,7 +179,7 @@ class EpisodeNoise:
 
     @property
     def address(self) -> int:
-        """Address of the memory into which :meth:`call_of_each` writes, in the layout of :func:`empty_lanes`."""
+        """Address of the memory into which :meth:`next_measurement_call` writes."""
         return address_of(self._next_call().arrays[2])
 
     def _copied_from_code(self) -> numpy.ndarray:
@@ -222,7 +205,7 @@ class EpisodeNoise:
         return self._ahead[self._slot - 1]
 
     def _numbers_ahead(self, lanes: numpy.ndarray, measurements: int) -> numpy.ndarray:
-        """Return the random numbers of the next measurements of some lanes, ``(measurements, rows, lanes)``."""
+        """Return the random numbers of the next measurements, ``(measurements, rows, lanes)``."""
         t = self.measurement[lanes] + numpy.arange(1, measurements + 1)[:, None]
         return numbers(self.identities[:, lanes], t, self._layout.normals, self._layout.row_uniforms)
 
@@ -231,20 +214,19 @@ class EpisodeNoise:
     def grow(self, count: int, index: numpy.ndarray) -> None:
         """Enlarge the memory of random numbers to ``count`` lanes.
 
-        Args:
-            count: new number of lanes, a multiple of eight.
-            index: for each lane the one whose numbers it uses until it begins an episode.
+        That is a multiple of eight; ``index`` is for each lane the one whose numbers it uses until it begins an
+        episode.
         """
         identities, measurement = self.identities[:, index], self.measurement[index]
         self._set_width(count)
         self.identities[...], self.measurement[...] = identities, measurement
 
     def snapshot(self) -> dict[str, Any]:
-        """Return a copy of the state that determines all further numbers, for :meth:`restore`."""
+        """Return a copy of the state that determines all further random numbers."""
         return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Restore the state of a snapshot of the same task with the same number of lanes."""
+        """Restore the state of a :meth:`snapshot` of the same task with the same number of lanes."""
         self.__dict__.update(copy.deepcopy(snapshot))
         self._forget()
 

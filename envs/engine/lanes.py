@@ -1,14 +1,14 @@
 """The engine: parallel episodes of a model, each determined by its identity.
 
 A *lane* is one episode after another, whose identities one generator draws (:mod:`.episode_noise`). Both Gymnasium
-classes and the evaluation use this class. It owns the noise and does not depend on spaces or autoreset.
+classes and the evaluation use :class:`Lanes`.
 
 **Bit equality.** The batch is padded to a multiple of eight lanes, also for one episode: BLAS chooses its
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
 environment with the same seed bit for bit.
 
-**Steppers.** A compiled model whose report can be traced moves its episodes in memory of its own
-(:class:`~.stepper.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
+**Steppers.** A compiled model whose report can be traced has a :class:`~.stepper.Stepper`, any other a
+:class:`ModelStepper`.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,13 +31,11 @@ from .stepper import Stepper, mean_reward
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
-    """Return the episode unchanged: the report function that reports the whole state."""
+    """Return the episode unchanged: a report function that reports the whole state."""
     return episode
 
 
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
-    """Return nested arrays ``old`` with the last-axis entries ``lanes`` replaced by those of ``new``."""
-
     def replaced(old: Array, new: Array) -> Array:
         # A copy, because states are never changed in place: the old one may still be in use.
         merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
@@ -48,47 +46,45 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
 
 
 class EpisodeStepper(Protocol):
-    """Protocol of the steppers of a model: :class:`.Stepper` and :class:`ModelStepper`.
+    """Protocol of the objects that step a model's episodes: :class:`.Stepper` and :class:`ModelStepper`.
 
     ``others`` are steppers of the same kind, width and task. Each call on the first one also
     applies to them, on the same noise.
     """
 
     def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
-        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
+        """Start new episodes in all lanes up to the first measurement; return the uniform and normal numbers used."""
         ...
 
     def begin_some(
         self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
     ) -> tuple[Array, Array]:
-        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
-        used.
-        """
+        """Start new episodes in some lanes up to the first measurement; return the uniform and normal numbers used."""
         ...
 
     def load(self, episode: Episode, observation: Array = None) -> None:
-        """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
+        """Replace the running episodes and their observation, ``(fields, width)``; None: compute it."""
         ...
 
     def episode(self) -> Episode:
-        """Return the current episodes of all lanes, in arrays that are never changed."""
+        """Return the running episodes of all lanes, in arrays that are never changed."""
         ...
 
     def take(self, action: Array) -> None:
-        """Set the action for the next decisions, batch first, for all lanes or for the first ones."""
+        """Set the action of the next decisions, batch first, for all lanes or for the first ones."""
         ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Step all lanes through the measurements for which one action holds, and compute the report on each."""
+        """Step all lanes through the measurements of one decision, and compute the report on each."""
         ...
 
     def reports(self) -> list[Any]:
-        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
+        """Return the reports of the last :meth:`decide`, one for each measurement, arrays ``(..., width)``."""
         ...
 
     @property
     def rewards(self) -> Any:
-        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, ``(interval, width)``, if the report is a reward."""
         ...
 
     def observation_by_field(self) -> Array:
@@ -104,7 +100,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def first_reward(self, baseline: Any) -> float:
-        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
+        """Return the first lane's mean reward of the last decision, minus that of a baseline if given."""
         ...
 
     def observation_of_first(self) -> Array:
@@ -113,13 +109,9 @@ class EpisodeStepper(Protocol):
 
 
 class ModelStepper:
-    """Stepper that calls the functions of the model on arrays that are never changed; methods as of :class:`.Stepper`.
-
-    ``others`` are steppers of the same kind, width and task: each call on this one also applies to them, on the same
-    noise.
+    """Stepper of episodes by the functions of a model that is not compiled.
 
     Args:
-        model: of the episodes.
         width: lanes, a multiple of eight.
         report: function of model and episodes after the action; None makes no report.
     """
@@ -137,21 +129,20 @@ class ModelStepper:
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
     ) -> tuple[Array, Array]:
-        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
-        noise.put(identities)
+        """Start new episodes in all lanes up to the first measurement; return the uniform and normal numbers used."""
+        noise.set_identities(identities)
         start = self._start(noise)
         for each in (self, *others):
             each.load(each.model.measure(each.model.begin(*start), noise.row))
         return start
 
     def _start(self, noise: EpisodeNoise) -> tuple[Array, Array]:
-        """Return the uniform and normal numbers of the start as arrays of the task."""
         task = self.model.task
         uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
         return uniforms, normals
 
     def load(self, episode: Episode, observation: Array = None) -> None:
-        """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
+        """Replace the running episodes and their observation, ``(fields, width)``; None: compute it."""
         self._episode, self.shown = episode, observation
 
     def begin_some(
@@ -161,10 +152,8 @@ class ModelStepper:
         noise: EpisodeNoise,
         others: "Sequence[ModelStepper]" = (),
     ) -> tuple[Array, Array]:
-        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
-        used.
-        """
-        noise.put(identities)
+        """Start new episodes in some lanes up to the first measurement; return the uniform and normal numbers used."""
+        noise.set_identities(identities)
         start = self._start(noise)
         for each in (self, *others):
             task = each.model.task
@@ -176,11 +165,11 @@ class ModelStepper:
         return start
 
     def episode(self) -> Episode:
-        """Return the current episodes of all lanes."""
+        """Return the running episodes of all lanes."""
         return self._episode
 
     def take(self, action: Array) -> None:
-        """Set the action for the next steps, batch first, for all lanes or for the first ones."""
+        """Set the action of the next decisions, batch first, for all lanes or for the first ones."""
         xp, turned = self.model.task.xp, action.T if action.ndim == 2 else action
         if not isinstance(self.model.action_space, gymnasium.spaces.Discrete):
             turned = xp.astype(turned, xp.float64, copy=False)
@@ -193,11 +182,11 @@ class ModelStepper:
         self._action = turned
 
     def take_alone(self, action: Array) -> None:
-        """Set the action of the first lane for the next steps."""
+        """Set the action of the first lane for the next decisions."""
         self.take(action[None])
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Step all lanes through the measurements for which one action holds, and compute the report on each."""
+        """Step all lanes through the measurements of one decision, and compute the report on each."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
         total: Any = 0.0
         for each in (self, *others):
@@ -215,16 +204,16 @@ class ModelStepper:
             self.shown = means.show(self.observation_by_field(), total, self.model.task.xp)
 
     def reports(self) -> list[Any]:
-        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
+        """Return the reports of the last :meth:`decide`, one for each measurement, arrays ``(..., width)``."""
         return self._reports
 
     @property
     def rewards(self) -> list[Array]:
-        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, ``(interval, width)``, if the report is a reward."""
         return self._reports
 
     def first_reward(self, baseline: "ModelStepper | None") -> float:
-        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
+        """Return the first lane's mean reward of the last decision, minus that of a baseline if given."""
         others = [0.0] * len(self._reports) if baseline is None else baseline._reports
         return float(mean_reward([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
@@ -246,14 +235,13 @@ class ModelStepper:
 
 
 class Lanes:
-    """``count`` parallel episodes (lanes) of a model.
+    """The engine: ``count`` lanes (parallel episodes) of a model.
 
     Args:
         model: task with a filter; the task's namespace determines the device of the arrays.
-        count: number of lanes.
         baseline: baseline of a relative reward, run on the same noise.
-        on_start: called with new episodes at the start of the track, before their first measurement.
-        longest: decisions after which an episode ends at the latest; default: the task's horizon.
+        on_start: called with new episodes before their first measurement.
+        longest: most decisions of an episode; default: the task's horizon.
         report: function of the later reports; the episodes then start in its code. Default: unknown.
 
     Attributes:
@@ -295,20 +283,18 @@ class Lanes:
     # --- episodes
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Set the generator from which a lane's next episodes are drawn."""
+        """Set the random generator that draws a lane's next episodes."""
         self.noise.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
-        """Draw and start new episodes in some lanes (default: all), up to their first measurement."""
+        """Draw and start new episodes in some lanes (default: all), up to the first measurement."""
         chosen = range(self.count) if lanes is None or len(lanes) == self.count else lanes
         self.begin(self.noise.draw_identities(chosen), chosen)
 
     def begin(self, identities: numpy.ndarray, lanes: Sequence[int] | None = None) -> None:
-        """Start the episodes with these identities, up to their first measurement.
+        """Start the episodes with these identities in some lanes, up to the first measurement.
 
-        Args:
-            identities: ``(2, lanes)``, see :mod:`.episode_noise`.
-            lanes: numbers of the lanes, ascending; default: all.
+        Identities are ``(2, lanes)``, see :mod:`.episode_noise`; the lanes are ascending, by default all.
         """
         task = self.task
         is_whole = lanes is None or len(lanes) == self.count
@@ -322,7 +308,7 @@ class Lanes:
         else:
             noise = self._noise_of_some(len(index))
             start = own.begin_some(index, identities, noise, baseline)
-            self.noise.take(noise, index)
+            self.noise.replace_episodes(noise, index)
         self.decisions[index] = 0
         if task.flights:
             lengths = task.lengths(host_array(start[0])[:, : identities.shape[1]]) // task.decision_interval
@@ -331,7 +317,6 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Return an :class:`EpisodeNoise` for ``count`` restarting lanes or a few more, from a cache."""
         width = LANES
         while width < count:
             width *= 2
@@ -340,11 +325,9 @@ class Lanes:
         return self._some[width]
 
     def step_reward(self, action: Array, kind: str) -> Array:
-        """Apply one action in all lanes and return the mean reward over its measurements, ``(count,)``.
+        """Apply one action in each lane; return the mean rewards over its measurements, ``(count,)``.
 
-        Args:
-            action: batch first, as the action space has it.
-            kind: one of :data:`~.reward.REWARDS`.
+        The action has the batch first; ``kind`` is one of :data:`~.reward.REWARDS`.
         """
         own, *baseline = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
         rewards = (
@@ -355,11 +338,9 @@ class Lanes:
         return mean_reward(rewards)[: self.count]
 
     def step_alone(self, action: Array, kind: str) -> tuple[Array, float, bool]:
-        """Apply one action where there is one lane; return its observation, reward, and whether the episode is over.
+        """Apply an action in the only lane; return observation, reward, and whether the episode is over.
 
-        Args:
-            action: as the action space has it.
-            kind: one of :data:`~.reward.REWARDS`; the reward equals that of :meth:`step_reward`.
+        The reward, of a kind of :data:`~.reward.REWARDS`, equals that of :meth:`step_reward`.
         """
         steppers, report = self._moving, REWARD_FUNCTIONS[kind]
         if steppers is not self._steppers.get(report):
@@ -372,7 +353,6 @@ class Lanes:
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
     def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
-        """Apply one action in all lanes and return the steppers that have the reports on its measurements."""
         steppers = self._reporting(report)
         steppers[0].take(action)
         steppers[0].decide(self.noise, steppers[1:])
@@ -380,7 +360,7 @@ class Lanes:
         return steppers
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
-        """Apply one action in all lanes and return the report on each of its measurements.
+        """Apply one action in each lane; return the reports on each of its measurements.
 
         Args:
             action: batch first, as the action space has it.
@@ -397,7 +377,7 @@ class Lanes:
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
-        """Run the episodes over many measurements in native code; return the reports on each and the actions.
+        """Run the episodes over many measurements in native code; return the reports on each, and the actions.
 
         Args:
             report: as of :meth:`decide`; :func:`.compiled.can_step` must be true for it.
@@ -417,21 +397,19 @@ class Lanes:
         return answer
 
     def next_row(self) -> Array:
-        """Return the random numbers of the next measurement, ``(row width, width)``, for episodes stepped elsewhere."""
+        """Return the random numbers of the next measurement, ``(row width, width)``, to step episodes elsewhere."""
         self.noise.advance()
         return self.noise.row
 
     # --- steppers
 
     def _by_functions(self) -> list[Any]:
-        """Return new :class:`ModelStepper` objects of task and baseline, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
         if self.baseline is not None:
             steppers[1].take(self._baseline_action(self.width))
         return steppers
 
     def _baseline_action(self, count: int) -> Array:
-        """Return the baseline's action, repeated for ``count`` lanes, batch first."""
         assert self.baseline is not None
         actions = [self.baseline.action] * count
         discrete = isinstance(self.baseline.action, int)
@@ -442,7 +420,7 @@ class Lanes:
         )
 
     def _reporting(self, report: Report) -> Sequence[Any]:
-        """Return the steppers that compute this report, after the current episodes were moved into them."""
+        """Return steppers that compute this report, into which the running episodes are moved."""
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
@@ -463,7 +441,6 @@ class Lanes:
         return after
 
     def _settle(self) -> list[ModelStepper]:
-        """Move the episodes into :class:`ModelStepper` objects and return these."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
@@ -483,7 +460,7 @@ class Lanes:
 
     @property
     def state(self) -> Any:
-        """The current episodes, lanes padded to a multiple of eight."""
+        """The running episodes of all lanes, padded to a multiple of eight."""
         return self._moving[0].episode()
 
     @state.setter
@@ -492,16 +469,11 @@ class Lanes:
         self._moving[0].load(state)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for pickling, without those bound to memory addresses."""
         self._settle()
         return {**self.__dict__, "_steppers": {}, "_some": {}}
 
     def grow(self, count: int) -> None:
-        """Enlarge to ``count`` lanes; the new ones run arbitrary episodes until they are restarted.
-
-        Args:
-            count: a multiple of eight.
-        """
+        """Enlarge to ``count`` lanes, whose new ones run arbitrary episodes until they are restarted."""
         self._settle()
         beyond = numpy.zeros(count - self.width, dtype=numpy.int64)
         index = self.task.xp.asarray(numpy.append(numpy.arange(self.width), beyond), device=self.task.device)
@@ -517,7 +489,6 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Return the current episodes and observations of task and baseline, in arrays that are never changed."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
@@ -525,21 +496,17 @@ class Lanes:
             stepper.load(episode, shown)
 
     def detach(self) -> None:
-        """Detach the episodes from the autograd graph (torch only)."""
+        """Detach the running episodes from the autograd graph (torch only)."""
         self._load(map_arrays(lambda tensor: tensor.detach(), self._episodes()))
 
     def snapshot(self) -> dict[str, Any]:
-        """Return a copy of the complete state, random numbers included, for :meth:`restore`."""
+        """Return a copy of the complete state of the episodes, random numbers included."""
         self._settle()
         kept = {"decisions": self.decisions.copy(), "_lengths": self._lengths.copy()}
         return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Restore the state of a snapshot of lanes of the same task.
-
-        Raises:
-            ValueError: if their number differs.
-        """
+        """Restore the state of a :meth:`snapshot`; ValueError if its number of lanes differs."""
         if snapshot["count"] != self.count:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         self.noise.restore(snapshot["noise"])
@@ -548,7 +515,7 @@ class Lanes:
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that just began in some lanes by numbers of decisions, to at least one."""
+        """Shorten the episodes that just began in some lanes by some decisions each, to one at least."""
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property

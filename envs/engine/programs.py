@@ -34,7 +34,6 @@ def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Arra
 
 
 def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
-    """Return the truth at the next measurement, and the measurement."""
     return model.task.world.advance(truth, noise, feedback)
 
 
@@ -45,12 +44,11 @@ def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
 
 
 def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
-    """Return the filter's state predicted to a measurement, without computing the observation."""
     return model.filter.predict(state, measurement)
 
 
 def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any]:
-    """Return the truth at the start of the track, and the initial estimate."""
+    """Simulate the start of the track: return the truth and the initial estimate."""
     return model.task.world.begin(Draws(uniforms, model.task.xp), normals)
 
 
@@ -61,7 +59,7 @@ def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
 
 
 class Parts(NamedTuple):
-    """Programs of the parts of a step, and the episode for whose shapes they are made."""
+    """Compiled programs of the parts of a step, and an episode with their shapes."""
 
     update: Specialised
     advance: Specialised
@@ -71,9 +69,9 @@ class Parts(NamedTuple):
 
 
 class _ComputedOnce:
-    """Property that is computed once, without a lock.
+    """Property that is computed once, without a lock, which a fork could leave locked in the child.
 
-    ``functools.cached_property`` has a lock before Python 3.12, which a fork could leave locked in a child for ever.
+    ``functools.cached_property`` has such a lock before Python 3.12.
     """
 
     def __init__(self, compute: Callable[[Any], Any]) -> None:
@@ -86,12 +84,12 @@ class _ComputedOnce:
 
 
 class Programs:
-    """Compiled programs of a task, shared by all models with its parameters.
+    """Compiled programs of a model's steps, shared by all models with the same parameters.
 
     Args:
         traced: the task on traced arrays.
         graph: graph of its constants.
-        of_world: programs of the same task with another filter, whose world these share.
+        of_world: programs of the same task with another filter, whose world is shared.
     """
 
     def __init__(self, traced: Model, graph: Graph, of_world: "Programs | None" = None) -> None:
@@ -105,11 +103,7 @@ class Programs:
         self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "Programs":
-        """Return the programs of the same task with another filter, from a cache.
-
-        Raises:
-            NotTraceable: if the filter is no straight line of arithmetic.
-        """
+        """Return the programs of the same task with another filter, from a cache."""
         if make not in self._with_filter:
             with namespace.tracing(self.graph):
                 programs = Programs(self.traced.with_filter(make), self.graph, self._of_world)
@@ -121,7 +115,7 @@ class Programs:
         return self._with_filter[make]
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached object of a key; if there is none, make it, cache it and drop the oldest."""
+        """Return the object with a key from the cache; if it is missing, make it and drop the oldest."""
         if key not in self._kept:
             made = make()
             while len(self._kept) >= PROGRAM_CACHE_SIZE:
@@ -140,24 +134,24 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """Compiled function of the filter's update; arrays of its state that never change are not written again."""
+        """Compiled update of the filter; constant arrays of its state are not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """Compiled function of a world's step; arrays of the truth that never change are not written again."""
+        """Compiled step of the world to the next measurement; constant arrays of the truth are not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_ComputedOnce
     def filter_prediction(self) -> CompiledFunction:
-        """Compiled function of the filter's prediction to a measurement, with the observation."""
+        """Compiled prediction of the filter to a measurement, with the observation."""
         return self.function(_predict, turned=True)
 
     @_ComputedOnce
     def world_start(self) -> Specialised:
-        """Compiled function of the world's start: truth and initial estimate."""
+        """Compiled start of the world: truth and initial estimate."""
         if self._of_world is not self:
             return self._of_world.world_start
         noise = self.traced.task.noise
@@ -166,7 +160,7 @@ class Programs:
 
     @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
-        """Compiled functions of the start of world and of filter."""
+        """Compiled starts of the world and of the filter."""
         truth, initial = self.world_start.example()
         return self.world_start, self.function(start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
@@ -174,17 +168,13 @@ class Programs:
 
     @_ComputedOnce
     def first(self) -> Parts:
-        """Compiled functions of the first step: from the start of the track to the first measurement."""
+        """Compiled parts of the first step, from the start of the track to the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Compiled functions of every later step: from an action to the next measurement.
-
-        Raises:
-            NotTraceable: if one is no straight line of arithmetic.
-        """
+        """Compiled parts of every later step, from an action to the next measurement."""
         first = self.first
         later = self._parts(first.advance.example()[0], *first.update.example())
         shapes = [
@@ -211,7 +201,7 @@ class Programs:
 
     @property
     def row(self) -> numpy.ndarray:
-        """Zeros in the shape of a measurement's random numbers, ``(normals + row_uniforms, 8)``."""
+        """Zeros in the shape of the random numbers of a measurement, ``(normals + row_uniforms, 8)``."""
         return numpy.zeros((self.traced.task.noise.normals + self.traced.task.noise.row_uniforms, 8))
 
     def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:
@@ -227,9 +217,5 @@ class Programs:
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def report_program(self, report: Report) -> Specialised:
-        """Return the compiled program of a report function.
-
-        Raises:
-            NotTraceable: if it is no straight line of arithmetic.
-        """
+        """Return the compiled program of a report function on the episodes."""
         return self.function(report).specialise(self.later.episode)

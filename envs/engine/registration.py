@@ -22,7 +22,7 @@ task."""
 
 
 def add_task(cls: type[Task]) -> None:
-    """Add a task to the catalogue and register it with Gymnasium; adding it again changes nothing.
+    """Check a user's task, add it to the catalogue and register it with Gymnasium; a second time do nothing.
 
     Args:
         cls: class that fulfils the contract of :class:`.task.Task`.
@@ -42,7 +42,6 @@ def add_task(cls: type[Task]) -> None:
 
 
 def _check_contract(cls: Any) -> None:
-    """Raise ValueError if a class lacks parts that an environment must declare."""
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__
@@ -93,7 +92,6 @@ def _check_contract(cls: Any) -> None:
 
 
 def _check_action(model: Model) -> None:
-    """Raise ValueError if the engine does not support the action space or the paper's action."""
     space: Any = model.action_space
     flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
     if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
@@ -113,7 +111,6 @@ def _check_action(model: Model) -> None:
 
 
 def _check_causes(model: Model) -> None:
-    """Raise ValueError if names of causes repeat or are reserved by the evaluation."""
     names = [cause.name for cause in Causes.of(model.task).causes]
     twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
     if twice or len(names) > MOST_CAUSES:
@@ -125,11 +122,7 @@ def _check_causes(model: Model) -> None:
 
 
 def _check_episodes(model: Model) -> None:
-    """Run a few episodes for two measurements on NumPy and compare shapes and values with the declaration.
-
-    Raises:
-        ValueError: for the first result that does not fit, or the first error.
-    """
+    """Run a few episodes for two measurements and raise ValueError if results contradict the declaration."""
     random, noise, names = (
         numpy.random.default_rng(0),
         model.task.noise,
@@ -223,9 +216,9 @@ def _check_episodes(model: Model) -> None:
 
 
 def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the arrays of nested tuples and dictionaries with names such as "load of the truth".
+    """Yield the arrays in nested tuples and dictionaries with names such as "load of the truth".
 
-    An object that is no array is yielded in its place.
+    An object that is no array is yielded, too.
     """
     if isinstance(part, dict):
         for field, value in part.items():

@@ -36,14 +36,14 @@ COMPRESSED_BEYOND = 30.0
 
 
 def compress(model: Model, counted: Array) -> Array:
-    """Return a counted cost in units of the paper's mean cost, compressed to ``30 log(1 + x / 30)``, ``(N,)``."""
+    """Return a counted cost over the paper's mean cost, compressed to ``30 log(1 + x / 30)``, ``(N,)``."""
     return COMPRESSED_BEYOND * model.task.xp.log1p(
         counted * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
     )
 
 
 def compressed_cost(model: Model, state: Any) -> Array:
-    """Return the compressed counted cost of the estimate, in units of the paper's mean cost, ``(N,)``."""
+    """Return the compressed cost of an estimate over the paper's mean cost, ``(N,)``."""
     return compress(model, model.counted_cost(state))
 
 
@@ -53,18 +53,18 @@ def cost_reward(model: Model, state: Any) -> Array:
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Return ``-log(1 + x)``, x the counted cost in units of an ordinary episode's cost, ``(N,)``."""
+    """Return ``-log(1 + x)``, x the cost of the estimate over that of an ordinary episode, ``(N,)``."""
     unit = model.task.reward.log_unit or model.task.reward.unit
     return -model.task.xp.log1p(model.counted_cost(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
-    """Return the log-density of the truth under the Gaussian with the reported mean and covariance, ``(N,)``."""
+    """Return the log-density of the truth under the Gaussian of reported mean and covariance, ``(N,)``."""
     return log_density(model.error(state), model.covariance(state))[0]
 
 
 def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
-    """Return minus the compressed cost plus the log-density of the truth per component, ``(N,)``."""
+    """Return minus the compressed cost, plus the log-density of the truth per component, ``(N,)``."""
     return cost_reward(model, state) + log_likelihood_reward(model, state) * (
         1.0 / len(model.task.components)
     )
@@ -100,7 +100,7 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
 
 
 def no_reward(model: Model, state: Any) -> Array:
-    """Return zeros ``(N,)``, the reward where the truth is unknown."""
+    """Return rewards of zero, ``(N,)``, for an unknown truth."""
     return 0.0 * model.mean(state)[0]
 
 
@@ -112,14 +112,14 @@ REWARD_FUNCTIONS: dict[str, Callable[[Model, Any], Array]] = {
     "log-relative": log_cost_reward,
     "none": no_reward,
 }
-"""Functions of a model and its episodes. Where there is a :func:`reference`, its reward is subtracted later. "none" is
-for recordings without truth."""
+"""Functions of a model and its episodes. The reward of a :func:`reward_baseline` is subtracted later. "none" is for
+recordings without truth."""
 REWARDS = tuple(kind for kind in REWARD_FUNCTIONS if kind != "none")
 """Kinds of reward that a user can choose."""
 
 
 class RewardBaseline(NamedTuple):
-    """Model and action whose reward on the same noise is subtracted in a relative reward."""
+    """Model and constant action whose reward on the same noise a relative reward subtracts."""
 
     model: Model
     """Model of the same task under the baseline's control."""
@@ -127,13 +127,8 @@ class RewardBaseline(NamedTuple):
     """Action of the baseline in every decision, an element of the control's space."""
 
 
-def reference(kind: str, model: Model) -> RewardBaseline | None:
-    """Return the :class:`RewardBaseline` of a kind of reward; None for a reward that is not relative.
-
-    Args:
-        kind: of reward.
-        model: in which the agent acts.
-    """
+def reward_baseline(kind: str, model: Model) -> RewardBaseline | None:
+    """Return the :class:`RewardBaseline` of a kind of reward for an agent's model; None if it is not relative."""
     if kind == "relative":
         paper = model.task.paper_policy
         return RewardBaseline(model.with_control(paper.control), paper.action)

@@ -1,8 +1,7 @@
 """Rollout of compiled episodes whose states are stored, and reverse-mode differentiation through them.
 
-Forward, every measurement writes the episodes after it into memory of their own. Backward, the code of a step's
-pullback (:mod:`..compiler.gradients`) computes the step again from them, and turns the gradient with respect to its
-output into that with respect to its input.
+Forward, every measurement writes the episodes after it into memory of their own. Backward, a step's pullback
+(:mod:`..compiler.gradients`) computes the step again from them.
 """
 
 import functools
@@ -19,7 +18,7 @@ from .reward import REWARD_FUNCTIONS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
-    """Reward whose gradient is computed."""
+    """Kind of reward whose gradient is computed, and the weight of a teacher's estimates in it."""
 
     kind: str
     """Kind of reward."""
@@ -28,7 +27,6 @@ class TrainingObjective(NamedTuple):
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
-    """Return the episode whose arrays are the rows of one array, ``(rows, N)``."""
     row = 0
 
     def leaf(array: numpy.ndarray) -> Any:
@@ -62,9 +60,9 @@ def _forward(
 def _backward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *others: Any
 ) -> Any:
-    """Return the gradients with respect to episodes and action, from those of the outputs of :func:`_forward`.
+    """Return the gradients with respect to episodes and action from those of :func:`_forward`'s outputs.
 
-    The last three arguments are the latter; those before them are the teacher's.
+    The latter are the last three arguments; those before them are the teacher's.
     """
     outputs = _forward(programs, reward, state, action, noise, *others[:-3])
     return tuple(pullback(programs.graph, outputs, others[-3:], (state, action)))
@@ -87,12 +85,10 @@ def _compile(programs: Programs, reward: TrainingObjective) -> tuple[Specialised
 
 
 class Rollout:
-    """Episodes of a compiled model under continuous actions, and the gradient of their rewards.
+    """Episodes of a compiled model under continuous actions, with reverse-mode gradients of their rewards.
 
     Args:
-        model: compiled.
         reward: objective of the gradient.
-        width: lanes, a multiple of eight.
         measurements: number stored at once.
 
     Attributes:
@@ -139,18 +135,18 @@ class Rollout:
         self._width, self._flown = width, 0
 
     def load(self, episode: Episode) -> None:
-        """Replace the current episodes, and delete the stored measurements."""
+        """Replace the running episodes, and delete the stored measurements."""
         values = [numpy.asarray(leaf).reshape(-1, self._width) for leaf in leaves(episode)]
         self._states[0][...] = numpy.concatenate(values)
         self._flown = 0
 
-    def go_on(self) -> None:
-        """Delete the stored measurements and continue from the current episodes."""
+    def drop_stored(self) -> None:
+        """Delete the stored measurements; the episodes continue."""
         self._states[0][...] = self._states[self._flown]
         self._flown = 0
 
     def forward(self) -> None:
-        """Apply :attr:`action` at the current measurement in all lanes, and step to the next measurement."""
+        """Apply :attr:`action` in all episodes, step to the next measurement and store it."""
         here = self._flown
         self._forward.table[self._addresses] = self._places[here]
         self._forward(0, self._width)

@@ -29,7 +29,7 @@ def _is_name(cls: type[Task], scenario: str) -> bool:
 
 
 def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
-    """Return the weights, summing to one, of a mixture of scenarios by name; None if the choice is no mixture.
+    """Return the weights by scenario name, summing to one, of a mixture of scenarios; None if it is no mixture.
 
     Args:
         cls: the environment.
@@ -77,7 +77,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
 
 def read_files(cls: type[Task], scenario: Any) -> Any:
-    """Return the flights or the recording that a path contains; return any other choice unchanged.
+    """Return the flights or the recording in a path's files; return any other choice of a scenario unchanged.
 
     Args:
         cls: the environment.
@@ -104,7 +104,7 @@ def find_scenario(
     scenario: ScenarioChoice | Scenario,
     keywords: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Return the :class:`Scenario` of a name (default: the environment's first) or of a user's trajectory or flights.
+    """Return the :class:`Scenario` that a user chooses by a name, flights or a recording.
 
     Args:
         cls: the environment.
@@ -145,7 +145,7 @@ def make_task(
     device: Any = None,
     **keywords: Any,
 ) -> Task:
-    """Return a task of a class, with a scenario and parameters, on the arrays of a namespace.
+    """Return a task with a scenario and parameters, its arrays in a namespace.
 
     Args:
         cls: the class of tasks.

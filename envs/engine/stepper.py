@@ -39,14 +39,12 @@ is read faster in one piece than row by row."""
 
 
 class Stepper:
-    """Episodes of a compiled model in fixed memory, which native code steps by actions.
+    """Stepper of a compiled model's episodes in fixed memory, by native code.
 
     Args:
-        model: compiled.
         report: function of the model and its episodes after the action.
         width: lanes, a multiple of eight.
-        world_of: a stepper of the same task, both filters in an open loop. The two share its world, and the
-            observation of this one is not used. Call it before this one.
+        world_of: stepper of the same task, both filters in an open loop, whose world is shared. Call it first.
 
     Attributes:
         action: applied at every step, ``(..., width)``.
@@ -162,7 +160,7 @@ class Stepper:
         self._action_place, self._report_place = len(update.inputs) - 1, len(report_code.inputs)
 
     def load(self, episode: Episode, observation: Array = None) -> None:
-        """Replace the current episodes and their observation, ``(fields, width)``."""
+        """Replace the running episodes and their observation, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values.reshape(memory.shape)
@@ -171,14 +169,14 @@ class Stepper:
             self._shown[...] = observation.T
 
     def episode(self) -> Episode:
-        """Return the current episodes of all lanes, in arrays that are never changed."""
+        """Return the running episodes of all lanes, in arrays that are never changed."""
         arrays = [array.reshape(*array.shape[:-2], self.width) for array in self._copies[self._now]]
         return copy_arrays(self._template, arrays, self._kinds)
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used.
+        """Start new episodes in all lanes up to the first measurement; return the uniform and normal numbers used.
 
         Args:
             identities: of the episodes, ``(2, lanes)``, see :mod:`.episode_noise`; the other lanes are padding.
@@ -189,12 +187,11 @@ class Stepper:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, valid until the next start.
         """
         self._policy_memory = None
-        noise.put(identities)
+        noise.set_identities(identities)
         self._run_bound(False, noise, others)
         return self._drawn
 
     def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Return the native call that starts episodes up to the first measurement, bound to memory."""
         turns = [[noise.start_call(self._start_numbers), draw] for _ in (0, 1)]
         for each in (self, *others):
             for begin, turn in zip(each._begin, turns, strict=True):
@@ -211,8 +208,7 @@ class Stepper:
         return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
-        """Run one decision, or one start, of this and the other steppers as one native call."""
-        draw = noise.call_of_each()
+        draw = noise.next_measurement_call()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         now, bound = self._now, self._bound.get(whole)
@@ -235,16 +231,9 @@ class Stepper:
         noise: EpisodeNoise,
         others: "Sequence[Stepper]" = (),
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers used.
+        """Start new episodes in some lanes up to the first measurement; return the uniform and normal numbers used.
 
-        Args:
-            lanes: numbers of the lanes, ascending.
-            identities: of the episodes, ``(2, lanes)``.
-            noise: of at least as many lanes.
-            others: steppers of the same task.
-
-        Returns:
-            Uniforms and normals of the start, as of :meth:`begin`.
+        Lanes are ascending, identities ``(2, lanes)``; ``noise`` is of at least as many lanes.
         """
         steppers = (self, *others)
         for each in steppers:
@@ -263,15 +252,15 @@ class Stepper:
         return start
 
     def take(self, action: numpy.ndarray) -> None:
-        """Set the action for the next steps, batch first, for all lanes or for the first ones."""
+        """Set the action of the next decisions, batch first, for all lanes or for the first ones."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
     def take_alone(self, action: numpy.ndarray) -> None:
-        """Set the action of the first lane for the next steps."""
+        """Set the action of the first lane for the next decisions."""
         self._first_action[...] = action
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Step all lanes of this and the other steppers through the measurements for which one action holds.
+        """Step all lanes of this and the other steppers through the measurements of one decision.
 
         One native call runs all of it for a tile of lanes.
         """
@@ -284,7 +273,6 @@ class Stepper:
             self._shown[:, self._means.columns] = total[:, self._averages]
 
     def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Return the native call for all measurements of a decision, bound to memory."""
         columns, interval = self._means.columns, self._interval
         if columns:
             self._passing = numpy.empty((interval, *self._shown.shape))
@@ -301,7 +289,7 @@ class Stepper:
             for now, turn in enumerate(turns):
                 turn += each._bound_copies(now, noise, each.reported, moving)
         passing = self._tiled(turns, others)
-        passing += self._let_pass(turns, noise, others) if self.width > self._together else []
+        passing += self._bind_temporaries(turns, noise, others) if self.width > self._together else []
         shown = [turn[len(self._calls[0])] for turn in turns]
         if self._passing is not None:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
@@ -312,15 +300,15 @@ class Stepper:
         ]
         return _bound(draw, sequences, [shown, shown] if interval > 1 else [shown[:1], shown[1:]])
 
-    def _let_pass(
+    def _bind_temporaries(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
     ) -> list[tuple[Call, int, int]]:
-        """Bind the temporary values of calls to memory of one tile of lanes, and return their places.
+        """Bind the temporary values of calls to memory of one tile of lanes; return where they are bound.
 
-        Temporary are the noise, and the filters between update and prediction. The places are those of
+        Temporary are the noise, and the filters between update and prediction. The result is ``passing`` of
         :class:`.CallSequence`.
         """
-        row = noise.call_of_each().arrays[2]
+        row = noise.next_measurement_call().arrays[2]
         places = {
             id(array): empty_lanes(array.shape[:-1], self._together)
             for each in (self, *others)
@@ -339,7 +327,7 @@ class Stepper:
     def _tiled(
         self, turns: Sequence[Sequence[Call]], others: "Sequence[Stepper]" = ()
     ) -> list[tuple[Call, int, int]]:
-        """Return the places of arrays of the first tile of lanes in the calls, as of :class:`.CallSequence`."""
+        """Return ``passing`` of a :class:`.CallSequence`: the arrays of calls that differ from tile to tile."""
         apart = {id(array): hop for each in (self, *others) for array, hop in each._apart}
         calls = [call for turn in turns for call in turn]
         places = [(call, place, apart.get(id(a), 0)) for call in calls for place, a in enumerate(call.arrays)]
@@ -348,9 +336,6 @@ class Stepper:
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
     ) -> list[Call]:
-        """Return copies of the calls of a step that begins with copy ``now``; append the report arrays to
-        ``moving``.
-        """
         calls = [call.copy() for call in self._calls[now]]
         if self._world_of is None:
             calls[-2].table[self._row_entry] = noise.address
@@ -358,7 +343,7 @@ class Stepper:
         return calls
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
-        """Run many measurements in one native call; return the reports on each and the policy's actions.
+        """Run many measurements in one native call; return the reports on each, and the policy's actions.
 
         Args:
             noise: of the measurements.
@@ -377,7 +362,7 @@ class Stepper:
         memories[0] = self._policy_memory or memories[0]
         if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
-        draw = noise.call_of_each()
+        draw = noise.next_measurement_call()
         turns: list[list[Call]] = []
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):
@@ -401,21 +386,20 @@ class Stepper:
         return map_arrays(lambda i: reports[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
-        """Return zero arrays in the shape of a compiled policy's memory."""
         blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
         return blank
 
     def reports(self) -> list[Any]:
-        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
+        """Return the reports of the last :meth:`decide`, one for each measurement, arrays ``(..., width)``."""
         return [
             copy_arrays(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
             for k in range(self._interval)
         ]
 
     def first_reward(self, baseline: "Stepper | None") -> float:
-        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
+        """Return the first lane's mean reward of the last decision, minus that of a baseline if given."""
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
             return own if baseline is None else own - baseline._first_rewards.item(0)
@@ -424,14 +408,14 @@ class Stepper:
 
     @property
     def rewards(self) -> numpy.ndarray:
-        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``.
+        """Rewards at the measurements of the last decision, ``(interval, width)``, if the report is a reward.
 
         Several rows are valid until the next decision.
         """
         return self.reported[0] if self._interval > 1 else self.reported[0].copy()
 
     def observation_by_field(self) -> numpy.ndarray:
-        """Return the observation, ``(fields, width)``, valid until the next step."""
+        """Return the observation of all lanes, ``(fields, width)``, valid until the next step."""
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
@@ -446,12 +430,11 @@ class Stepper:
         return self._first_shown.copy()
 
     def _show_in(self, memory: numpy.ndarray) -> None:
-        """Set the memory, ``(width, fields)``, into which later observations are written."""
         self._shown, self._first_shown, self._given = memory, memory[0], False
 
 
 class _Bound(NamedTuple):
-    """One native call, in two forms: from either of the two copies of the episodes."""
+    """One native call in two forms: from either of the two copies of the episodes."""
 
     draw: Call
     """Call that makes the noise of a measurement."""
@@ -461,13 +444,12 @@ class _Bound(NamedTuple):
 
 
 def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -> _Bound:
-    """Return the native calls that start from either copy of the episodes, combined in one object."""
     sequences[1].count_with(sequences[0])
     return _Bound(draw, sequences, shown)
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int, tile: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
-    """Return memory for several arrays, ``(numbers, tiles, tile)``, and views of it, ``(..., tiles, tile)`` each.
+    """Return memory for several arrays, ``(numbers, tiles, tile)``, and views, ``(..., tiles, tile)`` each.
 
     The numbers of a tile are adjacent.
     """

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
-    """Gymnasium environment of one episode of a task at a time.
+    """Gymnasium environment that runs one episode of a task at a time.
 
     Args:
         task: environment id.
@@ -35,10 +35,8 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
             cost and the further records of an evaluation.
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
-            return.
-        context: whether ``info["context"]`` contains the random draws of the episode and their current values
-            (:meth:`.World.context`), at resets and steps.
+        dtype: type of observations and rewards: "float64" (default), or "float32", to which they are rounded on return.
+        context: whether ``info["context"]`` contains the episode's random draws (:meth:`.World.context`).
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of "privileged" values, the context and the error after the last action in units of its reported
             standard deviation (zero at a reset). No policy may observe them where it is evaluated.
@@ -86,7 +84,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self._plain_action = self.action_space.shape if is_row else None
 
     def _picture_of(self, scenario: str) -> None:
-        """Create the picture of episodes of the current task, with the name of their scenario."""
         # Only here: matplotlib takes longer to import than an episode takes to run.
         from ..drawing.rendering import EpisodePicture
         from .late_picture import LatePicture
@@ -99,7 +96,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode; return the observation of its first measurement, and ``info``.
 
-        ``options["scenario"]``: as the argument ``scenario`` of the environment; None: the environment's own again.
+        ``options["scenario"]``: as the environment's argument ``scenario``; None: the environment's own again.
         ``options["parameters"]``: parameters that override those of the environment; ``{}`` for none. Each applies
         until a reset names another.
 
@@ -123,7 +120,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Return the observation of the only lane in the chosen type, with privileged values if wanted."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}
@@ -164,7 +160,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), reward, False, bool(self.fleet.done[0]), info
 
     def _show(self) -> None:
-        """Draw the episode into the window of render mode "human"."""
         if self._late is not None and self.render_mode == "human":
             self._late.show()
 
@@ -174,11 +169,10 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
-        """Return an image of the episode so far in mode "rgb_array"; None otherwise.
+        """Return an image of the episode so far in mode "rgb_array"; None in mode "human" or without a mode.
 
         Returns:
-            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
-            every reset and step anyway.
+            ``(height, width, 3)`` bytes, or None: every reset and step draws the window of "human" anyway.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.

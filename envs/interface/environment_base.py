@@ -33,7 +33,7 @@ def _no_truth(distribution: EpisodeDistribution) -> str:
 
 
 class EnvBase:
-    """Base class of both Gymnasium environments: a task, its spaces, and the reward."""
+    """Base class of both Gymnasium environments: lanes (parallel episodes) of tasks, spaces, reward."""
 
     model: Model
     """Model of the episode; with a mixture of scenarios in a vector environment, of the first scenario."""
@@ -52,7 +52,6 @@ class EnvBase:
         return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
-        """Store the options of the environment; raise ValueError for an unknown task or parameter."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
         self.options = options
@@ -78,15 +77,6 @@ class EnvBase:
         count: int,
         longest: int | None,
     ) -> None:
-        """Create the models of a scenario, their lanes, and the spaces of the environment.
-
-        Args:
-            make: function that makes a model from a scenario and parameters.
-            scenario: choice of the user.
-            keywords: parameters of the task.
-            count: number of lanes.
-            longest: decisions after which an episode ends at the latest.
-        """
         self._make, self._keywords = make, dict(keywords)
         distribution = self._distribution(scenario, {})
         if not all(model.task.has_whole_truth for model in distribution.models):
@@ -100,10 +90,9 @@ class EnvBase:
             self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
     def _disable_reward(self, distribution: EpisodeDistribution) -> None:
-        """Set the reward to zero for scenarios without truth.
+        """Set the reward to zero, for scenarios without truth.
 
-        Raises:
-            ValueError: if the user has chosen a reward, or privileged observations.
+        ValueError if the user has chosen a reward, or privileged observations.
         """
         wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
         wanted = "observation='asymmetric'" if self.privileged else wanted
@@ -114,11 +103,6 @@ class EnvBase:
     # --- scenarios
 
     def _distribution(self, scenario: Any, parameters: Mapping[str, Any]) -> EpisodeDistribution:
-        """Return the distribution of episodes over the tasks of a scenario or mixture, with overriding parameters.
-
-        Raises:
-            ValueError: for an unknown name, a value out of its limits, or a task with other spaces.
-        """
         keywords = {**self._keywords, **parameters}
         mixture = find_mixture(self._class, scenario)
         choices = [scenario] if mixture is None else list(mixture)
@@ -151,7 +135,6 @@ class EnvBase:
         return distribution
 
     def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
-        """Set the scenario and the parameters of a reset for the next episodes of these lanes."""
         if not {"scenario", "parameters"} & wanted.keys():
             return
         parameters = wanted.get("parameters")
@@ -197,13 +180,11 @@ class EnvBase:
         )
 
     def _to_dtype(self, values: Array) -> Array:
-        """Return numbers in the environment's floating-point type."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observations(self) -> Any:
-        """Return the observations of all lanes, batch first, with privileged values if wanted."""
         shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown
@@ -215,7 +196,6 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Return the context of all lanes by name, batch first, and for each part a mask of the lanes that have it."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp
@@ -225,10 +205,7 @@ class EnvBase:
     def _gather_reports(
         self, found: Sequence[Mapping[str, Array]]
     ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Return the reports of all lanes by name, combined from several tasks, and masks of the lanes with each part.
-
-        NaN stands for missing numbers.
-        """
+        """Return the reports on all lanes by name, NaN where missing, and masks of the lanes with each part."""
         xp, values, present = self.task.xp, {}, {}
         counts = [part.count for (part,) in self.fleet.parts()]
         for name in dict.fromkeys(name for one in found for name in one):
@@ -252,7 +229,7 @@ class EnvBase:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium specification; its ``max_episode_steps`` is the length of an episode in decisions."""
+        """Gymnasium specification of the environment, with the length of an episode in decisions."""
         return self._spec
 
     @spec.setter
@@ -269,7 +246,7 @@ class EnvBase:
     def _step_lanes(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
-        """Apply an action in all lanes and return the mean reward over its measurements, ``(count,)``.
+        """Apply an action in all lanes; return the mean rewards over its measurements, ``(count,)``.
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
@@ -288,9 +265,6 @@ class EnvBase:
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
-        """Apply an action in the lanes of one task; return rewards, and errors in sigmas for privileged
-        observations.
-        """
         task, count = lanes.task, lanes.count
         report = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
         results = lanes.decide(action, report)
@@ -305,7 +279,6 @@ class EnvBase:
         return mean_reward(rewards)[:count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
-        """Set the stored errors of lanes to zero, since new episodes have no estimate after an action."""
         if self.privileged:
             keep = numpy.ones((self.fleet.count, 1))
             keep[list(lanes)] = 0.0
@@ -313,5 +286,5 @@ class EnvBase:
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
-        """Name, unit and scale of every component of the observation, in order."""
+        """Name, unit and scale of every component of the observation."""
         return self.model.fields

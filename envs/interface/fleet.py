@@ -1,10 +1,8 @@
 """The fleet of an environment: its lanes (parallel episodes), of one task or of several tasks.
 
-A task has one set of parameters. While all episodes are of one task, the fleet is that task's
-:class:`~.lanes.Lanes`, and every call goes directly to them. Where scenarios are mixed, or a reset names another
-scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
-place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. An unused place is
-stepped too: the time of a step grows with the largest number of environments that ever ran each task at once.
+A task has one set of parameters. Where scenarios are mixed, or a reset names another scenario or other parameters,
+every distinct set has a task and :class:`~.lanes.Lanes` of its own. A lane's next episode gets a free place in the
+lanes of its task, which grow by eight places when none is free. Unused places are stepped, too.
 
 A lane's generator gives first, in a mixture only, the uniform number that chooses the task, then the identity of the
 episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed.
@@ -20,15 +18,15 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import REWARD_FUNCTIONS, reference
-from .specification import plain
+from ..engine.reward import REWARD_FUNCTIONS, reward_baseline
+from .specification import json_value
 
 ROOM = 8
 """Places by which lanes grow: a multiple of the width that arrays are padded to."""
 
 
 class EpisodeDistribution(NamedTuple):
-    """Distribution of the next episodes of a lane over scenarios."""
+    """Distribution of the next episodes of a lane over the tasks of its scenarios."""
 
     scenario: Any
     """Choice of the user."""
@@ -45,11 +43,11 @@ class EpisodeDistribution(NamedTuple):
         if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
-            alike = repr(plain(self.scenario)) == repr(plain(scenario))
-        return alike and repr(plain(self.parameters)) == repr(plain(parameters))
+            alike = repr(json_value(self.scenario)) == repr(json_value(scenario))
+        return alike and repr(json_value(self.parameters)) == repr(json_value(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
-        """Draw the index of the next episode's task by the weights; with one task, without a random number."""
+        """Draw the index of the next episode's task by the weights; a single task needs no random number."""
         if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
@@ -57,13 +55,7 @@ class EpisodeDistribution(NamedTuple):
 
 
 def check_alike(model: Model, other: Model, name: str) -> None:
-    """Raise ValueError if two tasks have different observation or action spaces.
-
-    Args:
-        model: model with the spaces of the environment.
-        other: model of the other task.
-        name: name of its scenario, for errors.
-    """
+    """Raise ValueError if two tasks have different observation or action spaces; ``name`` is the other's scenario."""
     properties: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
@@ -79,13 +71,12 @@ def check_alike(model: Model, other: Model, name: str) -> None:
 
 
 class Fleet:
-    """``count`` lanes (parallel episodes), each with its own :class:`EpisodeDistribution`.
+    """``count`` lanes (parallel episodes) of one task or of several, as their distributions draw them.
 
     Args:
-        count: number of lanes.
         distribution: of the episodes of all lanes, until :meth:`set_distribution` sets another.
         kind: kind of reward, which may need a baseline beside every episode.
-        longest: decisions after which an episode ends at the latest; default: its task's horizon.
+        longest: most decisions of an episode; default: its task's horizon.
     """
 
     def __init__(
@@ -113,11 +104,7 @@ class Fleet:
 
     @property
     def only(self) -> Lanes:
-        """The :class:`.Lanes` of the only task.
-
-        Raises:
-            ValueError: for several tasks.
-        """
+        """The :class:`.Lanes` of the only task; ValueError if there are several tasks."""
         if self.whole is not None:
             return self.whole
         if self.count > 1:
@@ -165,11 +152,10 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        beside, report = reference(self._kind, model), REWARD_FUNCTIONS[self._kind]
+        beside, report = reward_baseline(self._kind, model), REWARD_FUNCTIONS[self._kind]
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Return the :class:`.Lanes` of a task, which are made on first use."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
@@ -181,7 +167,6 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Delete the lanes of tasks no longer in use, and update the index of every environment's lane."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -209,7 +194,7 @@ class Fleet:
         self.whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Set the generator from which a lane's next episodes are drawn."""
+        """Set the random generator that draws a lane's next episodes."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
@@ -222,7 +207,7 @@ class Fleet:
             self.whole.restart(lanes)
             return
         if self.whole is not None:
-            self._leave(self.whole)
+            self._split_tasks(self.whole)
         self._sent = False
         chosen = list(range(self.count) if lanes is None else lanes)
         self._part[chosen] = -1
@@ -247,8 +232,8 @@ class Fleet:
             part.restart(free)
         self._arrange()
 
-    def _leave(self, whole: Lanes) -> None:
-        """Switch from the lanes of a single task to lanes of several tasks, and keep running episodes."""
+    def _split_tasks(self, whole: Lanes) -> None:
+        """Switch from the lanes of a single task to those of several tasks; running episodes continue."""
         self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)
@@ -258,14 +243,14 @@ class Fleet:
     # --- steps of the lanes
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Return a list of the :class:`.Lanes` of every task in use, with their entries of arrays ``(count, ...)``."""
+        """Return the :class:`.Lanes` of every task in use, each with its entries of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
         ]
 
     def gather(self, values: Sequence[Array]) -> Array:
-        """Return a new array ``(count, ...)`` from results for the :meth:`parts`, ``(places, ...)`` each."""
+        """Return one array ``(count, ...)`` from results for each of the :meth:`parts`, ``(places, ...)``."""
         if isinstance(values[0], numpy.ndarray):
             return (
                 numpy.array(values[0]) if self.whole is not None else numpy.concatenate(values)[self._where]
@@ -275,7 +260,7 @@ class Fleet:
         return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
     def step_reward(self, action: Array, kind: str) -> Array:
-        """Apply one action in all lanes and return the mean reward over its measurements, ``(count,)``."""
+        """Apply one action in each lane; return the mean rewards over its measurements, ``(count,)``."""
         if self.whole is not None:
             return self.whole.step_reward(action, kind)
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
@@ -288,20 +273,18 @@ class Fleet:
 
     @property
     def decisions(self) -> numpy.ndarray:
-        """Number of decisions in each lane's current episode, ``(count,)``."""
+        """Number of decisions so far in each lane's episode, ``(count,)``."""
         return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
 
     @property
     def done(self) -> numpy.ndarray:
-        """Whether the episode of each lane is over, booleans ``(count,)``; episodes of different tasks may differ in
-        length.
-        """
+        """Whether the episode of each lane is over, booleans ``(count,)``."""
         if self.whole is not None:
             return self.whole.done
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that just began in some lanes by numbers of decisions, to at least one."""
+        """Shorten the episodes that just began in some lanes by some decisions each, to one at least."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -311,21 +294,17 @@ class Fleet:
         return self.whole.has_episodes if self.whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
-        """Detach the episodes from the autograd graph (torch only)."""
+        """Detach the running episodes from the autograd graph (torch only)."""
         for (part,) in self.parts():
             part.detach()
 
     def snapshot(self) -> dict[str, Any]:
-        """Return a copy of the complete state, random numbers included, for :meth:`restore`."""
+        """Return a copy of the complete state of all episodes, random numbers included."""
         kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Restore the state of a snapshot of lanes of the same tasks.
-
-        Raises:
-            ValueError: if their number differs.
-        """
+        """Restore the state of a :meth:`snapshot`; ValueError if its number of lanes differs."""
         if snapshot["count"] != self.count:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         for name in _STATE_ATTRIBUTES:

@@ -13,14 +13,10 @@ from ..engine.lanes import Lanes
 
 
 class LatePicture:
-    """Picture of one episode, computed on request from its identity and actions.
+    """Picture of one episode, computed only on request, from the episode's identity and actions.
 
     Libraries set a render mode for environments that are not displayed (Stable-Baselines3's ``make_vec_env`` always),
-    and recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
-    identity determine an episode.
-
-    Args:
-        picture: picture to update.
+    and recording the values of a picture takes far longer than a step.
     """
 
     def __init__(self, picture: EpisodePicture) -> None:
@@ -42,7 +38,7 @@ class LatePicture:
 
     @property
     def picture(self) -> EpisodePicture:
-        """Picture of the episode, after all stored actions have been applied."""
+        """Up-to-date picture of the episode: the stored actions are applied first."""
         lanes, picture = self._lanes, self._picture
         if self._identity is not None:
             lanes.begin(self._identity)
@@ -59,7 +55,7 @@ class LatePicture:
             self._picture.keep(state, action, shown)
 
     def frame(self) -> numpy.ndarray:
-        """Return an image of the episode, ``(height, width, 3)`` bytes."""
+        """Return the picture of the episode as an image, ``(height, width, 3)`` bytes."""
         return self.picture.frame(self._lanes.state)
 
     def show(self) -> None:

@@ -12,14 +12,7 @@ from ..contract.task import Task
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
-    """Return errors over their reported standard deviations, ``(count, C)``; zero where these are zero.
-
-    Args:
-        error: ``(C, N)``.
-        covariance: ``(C, C, N)``.
-        count: number of lanes.
-        xp: array namespace.
-    """
+    """Return errors ``(C, N)`` over their reported standard deviations, ``(count, C)``; zero where these are zero."""
     error = error[:, :count].T
     variance = xp.stack([covariance[i, i, :count] for i in range(error.shape[1])], axis=-1)
     known = variance > 0.0

@@ -53,7 +53,7 @@ def _all_finite(values: Array) -> bool:
 
 
 def check_action(space: gymnasium.Space[Any], action: Any, count: int | None) -> Array:
-    """Return the action as an array or tensor; raise an error if it does not lie in the action space."""
+    """Return the action as an array or tensor; raise an error unless it lies in the action space."""
     if is_tensor(action):
         array, values = action, action.detach()
         floating, real = (
@@ -83,7 +83,7 @@ def _action_error(expected: str, action: Array) -> ValueError:
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of both environments beside the task and its parameters; see :class:`.TaskEnv`.
+    """Options of both Gymnasium environments beside task and parameters; see :class:`.TaskEnv`.
 
     Raises:
         ValueError: for a value that is not allowed.

@@ -14,21 +14,17 @@ from ..data.scenario_data import ScenarioData
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
     """Return a copy of a Gymnasium spec with the length of an episode, and keywords that JSON can store.
 
-    Gymnasium registers one length for an id; here it follows from scenario and parameters. It is computed on request:
-    the environment truncates by itself, without a ``TimeLimit`` wrapper.
-
-    Args:
-        spec: spec by Gymnasium.
-        decisions: in an episode.
+    Gymnasium registers one length for an id; here it follows from scenario and parameters. The environment truncates
+    by itself, without a ``TimeLimit`` wrapper.
     """
-    kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+    kwargs = {name: json_value(value) for name, value in spec.kwargs.items()}
     return dataclasses.replace(spec, max_episode_steps=decisions, kwargs=kwargs)
 
 
-def plain(value: Any) -> Any:
-    """Return a keyword's value in a JSON-compatible form from which the same environment can be made."""
+def json_value(value: Any) -> Any:
+    """Return a keyword's value in a form that JSON can store and that makes the same environment."""
     if isinstance(value, ScenarioData):
-        return {name: plain(item) for name, item in value.fields().items()}
+        return {name: json_value(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, numpy.ndarray | numpy.generic):
@@ -36,5 +32,5 @@ def plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, dict):
-        return {name: plain(item) for name, item in value.items()}
-    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+        return {name: json_value(item) for name, item in value.items()}
+    return type(value)(map(json_value, value)) if type(value) in (list, tuple) else value

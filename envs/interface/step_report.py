@@ -10,7 +10,7 @@ from ..engine.reward import REWARD_FUNCTIONS
 
 
 class StepReport(NamedTuple):
-    """Requested quantities, lanes last; the others are None."""
+    """Report on one measurement: requested quantities, lanes (parallel episodes) last; the others are None."""
 
     reward: Array
     """Reward, ``(N,)``; a relative one before that of the baseline is subtracted."""
@@ -26,13 +26,10 @@ class StepReport(NamedTuple):
 
 @functools.cache
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
-    """Return the function that computes a :class:`StepReport`; equal arguments return the same function.
+    """Return the function that computes a :class:`StepReport`, the same one for equal arguments.
 
-    Args:
-        kind: of reward, one of :data:`.reward.REWARD_FUNCTIONS`.
-        errors: whether error and covariance are reported.
-        details: whether ``info`` contains the details of the measurement.
-        episode: whether ``info`` contains the statistics of the episode.
+    It reports the reward of this kind, and if wanted error and covariance, the details of the measurement, and the
+    statistics of the episode for ``info``.
     """
     reward = REWARD_FUNCTIONS[kind]
 

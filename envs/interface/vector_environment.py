@@ -24,16 +24,12 @@ if TYPE_CHECKING:
 
 
 class _OneThread:
-    """Context manager that admits one thread at a time.
-
-    It uses a list, since a lock can be neither copied nor pickled with an environment.
-    """
+    """Context manager that admits one thread at a time; unlike a lock it can be copied and pickled."""
 
     def __init__(self) -> None:
         self._free = [True]
 
     def __enter__(self) -> None:
-        """Raise gymnasium.error.Error if another thread is inside."""
         try:
             self._free.pop()
         except IndexError:
@@ -46,36 +42,29 @@ class _OneThread:
 
 
 class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Gymnasium vector environment of many episodes of a task, natively vectorised.
+    """Gymnasium vector environment that runs many episodes of a task in parallel.
 
     Args:
         task: environment id.
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
             seed, for every number.
         control: name of a control; default: the first of the environment.
-        scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
-            mixture, ``{"random": 0.8, "paper": 0.2}``.
+        scenario: name of a scenario, a trajectory or its fields, a file with one, or a mixture, see :class:`.TaskEnv`.
         reward: "cost", "log-likelihood", "cost-and-likelihood", "relative" or "log-relative"; default: the
             environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
-            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, their
-            random numbers made on the host; float64 results differ by rounding. Torch's gradients flow from rewards and
-            observations back to actions that require them, over all steps since the last reset; pass detached
-            actions where none are wanted.
+            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same; float64 results differ by
+            rounding. Torch's gradients flow from rewards and observations back to actions that require them, over all
+            steps since the last reset; pass detached actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         threads: number of threads of the compiled backend; results do not depend on it.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on); None or -1: do not.
-        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
-            cost and the further records of an evaluation.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
-            return.
-        context: whether ``info["context"]`` contains the random draws of the episode and their current values
-            (:meth:`.World.context`), at resets and steps.
-        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
-            and of "privileged" values, the context and the error after the last action in units of its reported
-            standard deviation (zero at a reset). No policy may observe them where it is evaluated.
+        detailed_info: whether ``info`` carries the details that :class:`.TaskEnv` lists.
+        dtype: type of observations and rewards: "float64" (default), or "float32".
+        context: whether ``info["context"]`` contains the random draws of the episode (:meth:`.World.context`).
+        observation: "measured" (default), or "asymmetric" with privileged values, see :class:`.TaskEnv`.
         **keywords: parameters of the task.
 
     Raises:
@@ -228,7 +217,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self._observations(), self._with_context({}, begun)
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
-        """Return ``info`` with the context of some lanes added in Gymnasium's form, if it is wanted."""
         if self.options.context and lanes.any():
             values, present = self._context()
             context = {}
@@ -306,7 +294,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
-        """Return a function that adds the states of this step to the pictures; None without a render mode."""
         if self.pictures is None:
             return None
         pictures, actions, shown = self.pictures, host_array(action), host_array(self.fleet.observe())
@@ -316,8 +303,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return images of the first few sub-environments in mode "rgb_array"; None otherwise.
 
         Returns:
-            A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
-            far longer than stepping. None without a render mode.
+            A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -337,7 +323,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Return ``info`` in Gymnasium's form: beside every key the mask of the sub-environments that have it."""
         if not mask.any():
             return {}
         masked = {}
@@ -352,11 +337,10 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return tensor_on(array, self.device)
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
-        """Return a copy of booleans ``(num_envs,)`` on the device of the backend."""
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
-        """Return last observations in Gymnasium's form: an object for each finished sub-environment, else None.
+        """Return last observations in Gymnasium's form: an object for each finished lane, else None.
 
         With the torch backend one tensor, the last observation of every lane: splitting it would need a
         transfer for each lane.

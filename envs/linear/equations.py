@@ -2,9 +2,9 @@ r"""Equations of a state-space model, and their values on the arrays of a task.
 
     x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R(x(k), dt, u))
 
-dt is the interval between the measurements k - 1 and k, and u the constant input that acted in it. A model may have
-neither, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known only with white noise of
-covariance N, the predicted covariance is
+dt is the interval between the measurements k - 1 and k, and u the constant input in it. A model may have neither. A
+filter evaluates R at the predicted state. Where u is known only with white noise of covariance N, the predicted
+covariance is
 
     P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
 
@@ -38,7 +38,7 @@ from .sensors import Channel
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel:
-    """Equations of a state-space model.
+    """Equations of a state-space model, such as f, Q, h and R.
 
     Functions of the motion take the state, then the interval where the model is timed, s, and then the inputs.
     """
@@ -62,18 +62,13 @@ class StateSpaceModel:
 
     @property
     def timed(self) -> bool:
-        """Return whether f and Q depend on the interval between measurements."""
+        """Whether f and Q depend on the interval between measurements."""
         return isinstance(self.Q, VectorFunction)
 
     def allows_zero_interval(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
-        """Return whether f is the identity and Q zero for an interval of zero, so that measurements may be
-        simultaneous.
+        """Return whether f is the identity and Q zero over no time, judged numerically at a few states.
 
-        The method checks this numerically at a few states.
-
-        Args:
-            mean: centre of the states that are checked, ``(n,)``.
-            inputs: typical inputs, ``(p,)``.
+        Then measurements may be simultaneous.
         """
         if not isinstance(self.Q, VectorFunction):
             return False
@@ -85,14 +80,14 @@ class StateSpaceModel:
 
     @property
     def is_linear(self) -> bool:
-        """Return whether both f and h are given as matrices."""
+        """Whether both f and h are given as matrices."""
         maps = (self.f, self.h)
         return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
 
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceDefinition:
-    """Models, initial estimate, cost weights, inputs and sensors of a task of state-space models."""
+    """Definition of a task of state-space models: models, initial estimate, cost weights, inputs, sensors."""
 
     world: tuple[StateSpaceModel, ...]
     """The M models of the world."""
@@ -117,31 +112,27 @@ class StateSpaceDefinition:
 
     @property
     def nominal_inputs(self) -> numpy.ndarray:
-        """Return the mean values of the inputs, ``(p,)``."""
+        """Mean values of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
     @property
     def measurement_words(self) -> str:
-        """Return a sentence that lists the numbers of a measurement and the inputs, with units."""
+        """Sentence that lists the numbers of a measurement and the inputs, with units."""
         words = f"Of a measurement, values and available are of {', '.join(self.measured)}, in this order"
         inputs = ", ".join(self.inputs)
         return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
 
     def nominal_process_noise(self, interval: float) -> numpy.ndarray:
-        """Return Q of the filters' first model at the initial mean for an interval, s, ``(n, n)``."""
+        """Return the first filter model's Q over an interval, s, at the initial mean, ``(n, n)``."""
         return process_noise(self.filters[0], self.mean, interval, self.nominal_inputs)
 
 
 def process_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: float, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """Return the process noise covariance Q of a model, ``(n, n)``; constant if the model is not timed.
+    """Return the process noise covariance Q of a model, ``(n, n)``.
 
-    Args:
-        model: the equations.
-        x: state, ``(n,)``.
-        interval: s.
-        inputs: ``(p,)``.
+    ``x`` is a state ``(n,)``, ``interval`` in s, ``inputs`` ``(p,)``.
     """
     if not isinstance(model.Q, VectorFunction):
         return model.Q
@@ -155,11 +146,7 @@ def sensor_noise(
 ) -> numpy.ndarray:
     """Return the measurement noise covariance R of a model at K measurements, ``(m, m, K)``.
 
-    Args:
-        model: the equations.
-        x: state, ``(n,)``.
-        interval: s, ``(K,)``.
-        inputs: ``(p, K)``.
+    ``x`` is a state ``(n,)``, ``interval`` in s ``(K,)``, ``inputs`` ``(p, K)``.
     """
     m, K = model.h.size, len(interval)
     if not isinstance(model.R, VectorFunction):
@@ -173,8 +160,7 @@ def nominal_sensor_noise(
 ) -> numpy.ndarray:
     """Return R of a model at the initial mean, averaged over the distribution of the inputs, ``(m, m)``.
 
-    The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: where the standard
-    deviation is an input, R is the sum of its squared mean and its variance.
+    The average over 2 p sigma points is exact where R is quadratic in the inputs, such as a standard deviation.
 
     Args:
         model: the equations.
@@ -192,7 +178,7 @@ def nominal_sensor_noise(
 
 
 class InvalidNoise(NamedTuple):
-    """A measurement whose R is not positive definite."""
+    """Measurement and sensor whose R is not positive definite, and that R."""
 
     place: int
     """Index of the measurement."""
@@ -206,13 +192,8 @@ def find_invalid_noise(
 ) -> InvalidNoise | None:
     """Return the first of K measurements at which a sensor's R is not positive definite; None if there is none.
 
-    Sensors whose R depends on the state are skipped.
-
-    Args:
-        definition: the models.
-        available: above zero where a number was received, ``(m, K)``.
-        interval: s, ``(K,)``.
-        inputs: ``(p, K)``.
+    Sensors whose R depends on the state are skipped. ``available``, ``(m, K)``, is above zero where a number was
+    received.
     """
     n = len(definition.mean)
     for model in definition.filters:
@@ -235,7 +216,7 @@ def find_invalid_noise(
 
 
 class StateSpaceMeasurement(NamedTuple):
-    """Values of all sensors, with the interval and the inputs."""
+    """Values of all sensors at one time, with the interval, the inputs, and delayed values."""
 
     values: Array
     """Measured values, ``(m, N)``; arbitrary where nothing was received."""
@@ -253,7 +234,7 @@ class StateSpaceMeasurement(NamedTuple):
 
 
 class Passage(NamedTuple):
-    """Interval and inputs up to a measurement that has not been made yet."""
+    """Interval and inputs up to the next measurement."""
 
     interval: Array | None
     inputs: Array | None
@@ -280,16 +261,13 @@ class StateSpaceProblem(Task):
         self.transition: Array = self.constant([list(row) for row in own.transition])
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between measurements, s; None where it varies."""
         return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
 
 
 class Equations:
-    """The equations of a model on the arrays of a task.
+    """Equations of a state-space model on the arrays of a task.
 
-    Args:
-        task: the task, which provides the arrays.
-        model: the equations.
+    In the methods x are states, ``(n, N)``, and ``passed`` the interval and inputs until the next measurement.
     """
 
     def __init__(self, task: StateSpaceProblem, model: StateSpaceModel) -> None:
@@ -314,28 +292,20 @@ class Equations:
         return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:
-        """Return the state f(x) at the next measurement, without process noise, ``(n, ...)``.
-
-        Args:
-            x: ``(n, ...)``.
-            passed: interval and inputs until then.
-        """
+        """Return the state f(x) at the next measurement, without process noise, ``(n, ...)``."""
         return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
-        """Return the state with the interval and the inputs appended as rows, ``(n + 1 + p, ...)``."""
+        """Return the state with interval and inputs appended as rows, ``(n + 1 + p, ...)``."""
         rows = [] if passed.interval is None else [passed.interval]
         if passed.inputs is not None:
             rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
         return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
 
     def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
-        """Return the process noise covariance Q, ``(n, n, N)``; ``(n, n, 1)`` where the model is not timed.
+        """Return the process noise covariance Q, ``(n, n, N)``; ``(n, n, 1)`` where it is constant.
 
-        Args:
-            x: predicted state, ``(n, N)``.
-            passed: interval and inputs until then.
-            of_sources: factors on some terms of Q by their names, a number or ``(N,)`` each.
+        ``of_sources`` are factors on terms of Q by name, a number or ``(N,)`` each.
         """
         if not of_sources:
             return self._noise(self.model.Q, self._Q, x, passed)
@@ -357,13 +327,7 @@ class Equations:
         return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
-        """Return the covariance ``G N G^T`` that the inputs' noise adds to the prediction, ``(n, n, N)``, or 0.0
-        without it.
-
-        Args:
-            x: state at the previous measurement, ``(n, N)``.
-            passed: interval and inputs since then.
-        """
+        """Return the covariance ``G N G^T`` that noise of the inputs adds to a prediction, ``(n, n, N)``, or 0.0."""
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
     def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
@@ -371,7 +335,6 @@ class Equations:
         return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
-        """Return the covariance that the inputs' noise causes in the output of a function of inputs and state."""
         if function is None:
             return 0.0
         assert passed.inputs is not None
@@ -387,11 +350,7 @@ class Equations:
     ) -> Array:
         """Return the measurement noise covariance R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
-        Args:
-            x: state at the measurement, ``(n, N)``.
-            passed: interval and inputs until then.
-            factor: a number, or ``(N,)``.
-            of_sensors: further factors for some sensors, by their names.
+        ``of_sensors`` are further factors for some sensors, by their names.
         """
         R = factor * self._noise(self.model.R, self._R, x, passed)
         if not of_sensors:
@@ -403,33 +362,23 @@ class Equations:
         return self.xp.stack(rows)
 
     def measure(self, x: Array, passed: Passed) -> Array:
-        """Return the measurement h(x) without noise, ``(m, ...)``.
-
-        Args:
-            x: ``(n, ...)``.
-            passed: interval and inputs until then.
-        """
+        """Return the measurement h(x) without noise, ``(m, ...)``."""
         return self._value("h", self.model.h, self._with_inputs(x, passed))
 
     def _with_inputs(self, x: Array, passed: Passed) -> Array:
         return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
     def subtract(self, z: Array, predicted: Array) -> Array:
-        """Return the innovation, measurement minus prediction, ``(m, ...)``; angles lie within half a turn."""
+        """Return the innovation, measurement minus prediction, ``(m, ...)``; of angles within half a turn."""
         return shorten(z - predicted, self.periods)
 
     def continuous_measurement(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the measurement function with unwrapped angles, and the sigma points of an unscented transform for it.
+        """Return the function h with unwrapped angles, and sigma points of an unscented transform for it.
 
-        Along a state in which an angle is linear it follows its slope over any number of turns. Along the others it
-        changes by less than half a turn, for which the points are close enough.
-
-        Args:
-            mean: predicted state, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            passed: interval and inputs until then.
+        An angle follows its slope over any number of turns along states in which it is linear; along the others the
+        points are so close that it changes by less than half a turn.
         """
         return self._unfold(
             partial(self.measure, passed=passed),
@@ -441,13 +390,7 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the motion function with angles unwrapped to the mean's turn, and sigma points for it.
-
-        Args:
-            mean: state, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            passed: interval and inputs until the next measurement.
-        """
+        """Return the function f with angles unwrapped to the mean's turn, and sigma points for it."""
         return self._unfold(
             partial(self.move, passed=passed),
             (self.model.f, lambda: self.transition_matrix(mean, passed), self.angles),
@@ -462,7 +405,7 @@ class Equations:
         mean: Array,
         covariance: Array,
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return a function with angles unwrapped from the mean to each sigma point, and points close enough for that.
+        """Return a function with angles unwrapped from the mean to the sigma points, and points close enough.
 
         Args:
             function: from points ``(n, 2n + 1, N)``.
@@ -487,21 +430,13 @@ class Equations:
         return continuous, limit_spread(turns, covariance, QUARTER)
 
     def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
-        """Return the innovation, Jacobian H and noise R of the received numbers of a measurement.
-
-        Args:
-            measurement: finite also where nothing was received.
-            mean: predicted mean, ``(n, N)``.
-            R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
-        """
+        """Return the innovation, Jacobian H and noise R of the received numbers of a measurement."""
         nu = self.subtract(measurement.values, self.measure(mean, measurement))
         R = self.measured_noise(R, mean, measurement)
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Return the Kalman gain, ``(n, m, N)``, for a covariance ``(n, n, N)``; zero for sensors outside their
-        gates.
-        """
+        """Return the Kalman gain ``(n, m, N)`` for a covariance ``(n, n, N)``; zero for sensors outside their gates."""
         if self.gated:
             S = product(product(received.H, covariance), transpose(received.H)) + received.R
             kept = self.within_gates(received.innovation, S)
@@ -509,12 +444,7 @@ class Equations:
         return kalman_gain(covariance, received)
 
     def within_gates(self, nu: Array, S: Array) -> Array:
-        """Return 1 for numbers of sensors whose innovation passes the sensor's gate, else 0, ``(m, N)``.
-
-        Args:
-            nu: innovation, ``(m, N)``.
-            S: its covariance, ``(m, m, N)``.
-        """
+        """Return 1 for the numbers of sensors whose innovation passes the sensor's gate, else 0, ``(m, N)``."""
         xp, rows = self.xp, []
         for channel in self.channels:
             within = 1.0 + 0.0 * nu[channel.first]
@@ -529,9 +459,6 @@ class Equations:
         return self.xp.reshape(values, (function.size, *x.shape[1:]))
 
     def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
-        """Return a function's values at vectors ``(n, N)``; name the function in a warning about values that are not
-        finite.
-        """
         if self.xp is not numpy:
             return compute(x, self.xp)
         with numpy.errstate(all="ignore"):
@@ -544,7 +471,6 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Return a text on a function's first value that is not finite, at a finite state; empty if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():
@@ -567,16 +493,7 @@ class Equations:
     def explain_loss(
         self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: StateSpaceMeasurement
     ) -> str:
-        """Return a sentence naming the function that is not finite near an estimate at the next measurement.
-
-        Args:
-            mean: last valid mean, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            measurement: the next one.
-
-        Returns:
-            A sentence; empty where f and h are finite.
-        """
+        """Return a sentence that names the function, f or h, that is not finite near an estimate; else empty."""
         with numpy.errstate(all="ignore"):
             points = sigma_points(mean, covariance)
             given = self._with_passed(points, measurement).reshape(-1, points[0].size)
@@ -588,25 +505,19 @@ class Equations:
             return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
-        """Return the Jacobian F of f, ``(n, n, N)``; the last axis has length 1 where it is constant."""
+        """Return the Jacobian F of f, ``(n, n, N)``; ``(n, n, 1)`` where it is constant."""
         if self._F is not None:
             return self._F[:, :, None]
         return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
-        """Return the Jacobian H of h, ``(m, n, N)``; the last axis has length 1 where it is constant."""
+        """Return the Jacobian H of h, ``(m, n, N)``; ``(m, n, 1)`` where it is constant."""
         if self._H is not None:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
-    def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
-        """Return the predicted mean and covariance at the next measurement, without process noise.
-
-        Args:
-            mean: ``(n, N)``.
-            covariance: ``(n, n, N)``.
-            passed: interval and inputs until then.
-        """
+    def predict_moments(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
+        """Return mean and covariance predicted to the next measurement, without process noise."""
         F = self.transition_matrix(mean, passed)
         carried = product(product(F, covariance), transpose(F))
         if self.model.G is not None:

@@ -18,7 +18,7 @@ from ..contract.observation import Array
 
 @dataclass(frozen=True)
 class Input:
-    """A known input: its Gauss-Markov process in a simulation, and the noise of the value that filters receive.
+    """Known input of a state-space model: its Gauss-Markov process in a simulation, and its reported noise.
 
     Raises:
         ValueError: for a number that is not finite or out of range.
@@ -45,11 +45,7 @@ class Input:
 
 
 class InputProcesses:
-    """Gauss-Markov processes of the inputs of a simulation.
-
-    Args:
-        inputs: the p inputs.
-        xp: array namespace.
+    """Gauss-Markov processes of the p inputs of a simulation.
 
     Attributes:
         initial_normals: number of standard normal numbers at the start, p.
@@ -64,11 +60,7 @@ class InputProcesses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None without inputs.
-
-        Args:
-            normals: standard normal numbers, ``(p, N)``.
-        """
+        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None if p is 0."""
         if not self.inputs:
             return None
         each = zip(self.inputs, normals, strict=True)
@@ -77,10 +69,7 @@ class InputProcesses:
     def advance(self, inputs: Array, interval: Array, normals: Array) -> Array:
         """Return the inputs that act until the next measurement, ``(p, N)``.
 
-        Args:
-            inputs: those that acted until the previous measurement, ``(p, N)``.
-            interval: s, ``(N,)``.
-            normals: standard normal numbers, ``(normals, N)``.
+        ``inputs`` are those until the previous measurement, ``interval`` is in s, ``normals`` are ``(normals, N)``.
         """
         xp, after = self.xp, []
         for j, one in enumerate(self.inputs):
@@ -90,12 +79,7 @@ class InputProcesses:
         return xp.stack(after)
 
     def report(self, inputs: Array, normals: Array) -> Array:
-        """Return the inputs with noise, as filters receive them, ``(p, N)``.
-
-        Args:
-            inputs: those that act, ``(p, N)``.
-            normals: standard normal numbers, ``(normals, N)``.
-        """
+        """Return the inputs with noise, as filters receive them, ``(p, N)``."""
         reported = [inputs[j] for j in range(len(self.inputs))]
         for place, j in enumerate(self.noisy):
             reported[j] = reported[j] + self.inputs[j].noise * normals[len(reported) + place]

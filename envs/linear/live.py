@@ -14,7 +14,7 @@ UNEVEN = 0.01
 
 
 class StateSpaceInput(LiveInput):
-    """Converter of live values of sensors and inputs into measurements, by the names of numbers or sensors.
+    """Converter of live values of sensors and inputs into measurements of a state-space model.
 
     A timed model accepts any interval, and zero where the state does not move in it. Any other model accepts only its
     sampling interval.
@@ -45,12 +45,12 @@ class StateSpaceInput(LiveInput):
         return {**names, **inputs, **found}, at_start
 
     def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the initial estimate and a memory in which the inputs are unknown (NaN)."""
+        """Return the initial estimate, and a memory in which the inputs are unknown (NaN)."""
         initial, memory = super().start(time, initial_values)
         return initial, {**memory, "inputs": self.broadcast(numpy.nan, (len(self.inputs),))}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the measurement from the values of one time, and the memory for the next one.
+        """Return the measurement from the values at one time, and the memory for the next one.
 
         Raises:
             ValueError: if the model cannot move by this interval.
@@ -72,7 +72,6 @@ class StateSpaceInput(LiveInput):
         return self._checked(super().measure(memory, time, values), interval)
 
     def _checked(self, made: tuple[Any, Memory], interval: Any) -> tuple[Any, Memory]:
-        """Return ``made`` unchanged; raise ValueError if the inputs make R of a sensor not positive definite."""
         if not self._noise_varies:
             return made
         measurement, N = made[0], self.tracks
@@ -88,11 +87,6 @@ class StateSpaceInput(LiveInput):
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values by name with the numbers of all sensors in one array, ``(m, N)``, for one track ``(m,)``.
-
-        Raises:
-            ValueError: if a number is given twice.
-        """
         named = [name for name in self._names if values.get(name) is not None]
         if named in ([], ["values"]):
             return dict(values)
@@ -109,11 +103,7 @@ class StateSpaceInput(LiveInput):
         return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the newest value of each input, ``(p, N)``, for one track ``(p,)``: without a new one the last.
-
-        Raises:
-            ValueError: if an input has had no value so far.
-        """
+        """Return the newest value of each input, ``(p, N)`` or ``(p,)``; without a new one the last."""
         given = numpy.array([self.read(values, name) for name in self.inputs])
         found = numpy.where(numpy.isfinite(given), given, before)
         if not numpy.isfinite(found).all():

@@ -7,7 +7,7 @@ from ..contract.parameters import TaskParameters, parameter
 
 @dataclass(frozen=True)
 class StateSpaceParameters(TaskParameters):
-    """Parameters of every task of state-space models."""
+    """Parameters of a task of state-space models, beside its models."""
 
     sampling_interval: float = parameter(1.0, above=0.0)
     """Time between measurements, s; the average for a timed model."""

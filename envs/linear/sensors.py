@@ -31,7 +31,7 @@ EARLY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A sensor of a state-space model.
+    """Sensor of a state-space model: its equation, noise, rate, availability and gate.
 
     Raises:
         ValueError: if a field is outside its limits.
@@ -65,7 +65,7 @@ class Sensor:
 
 
 class Channel(NamedTuple):
-    """A sensor's place among the m numbers of a measurement, with its rate, availability and gate."""
+    """Indices of a sensor's numbers in a measurement, with its rate, availability and gate."""
 
     name: str
     first: int
@@ -78,16 +78,16 @@ class Channel(NamedTuple):
 
     @property
     def places(self) -> slice:
-        """Return the slice of the sensor's numbers in a measurement."""
+        """Slice of the sensor's numbers in a measurement."""
         return slice(self.first, self.first + self.size)
 
     @property
     def numbers(self) -> range:
-        """Return the indices of the sensor's numbers in a measurement."""
+        """Indices of the sensor's numbers in a measurement."""
         return range(self.first, self.first + self.size)
 
     def is_received(self, available: Array) -> Array:
-        """Return booleans ``(N,)``: whether any number of the sensor was received, from ``available``, ``(m, N)``."""
+        """Return whether any number of the sensor was received, booleans ``(N,)``, from ``available``, ``(m, N)``."""
         found = available[self.first] > 0.0
         for place in self.numbers[1:]:
             found = found | (available[place] > 0.0)
@@ -95,7 +95,7 @@ class Channel(NamedTuple):
 
 
 def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
-    """Return one cause for each of several sensors: that it gives no value at a measurement."""
+    """Return one cause of cost for each of several sensors: it gives no value at a measurement."""
 
     def cause(channel: Channel) -> Cause:
         def holds(moment: Moment) -> Array:
@@ -107,7 +107,7 @@ def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
 
 
 class SensorStates(NamedTuple):
-    """State of the sensors of a simulation."""
+    """State of the simulated sensors: time since the last value, gaps, offset."""
 
     waited: Array | None = None
     """Time since each sensor with an interval was due, s, ``(sensors, N)``."""
@@ -118,12 +118,9 @@ class SensorStates(NamedTuple):
 
 
 class Receptions:
-    """Simulation of which sensor values arrive: rates, gaps and losses; and of one sensor's offset.
+    """Simulation of which sensor values arrive (rates, gaps, losses), and of one sensor's offset.
 
     Args:
-        parameters: parameters of the task.
-        xp: its array namespace.
-        channels: the sensors.
         deviations: standard deviations of the noise of the m numbers, ``(m,)``.
 
     Attributes:
@@ -147,7 +144,7 @@ class Receptions:
         self.row_uniforms: int = len(self.lossy) + len(self.channels) * self.has_gaps
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
-        """Return the sensors' state at the start of the track from zeros ``(N,)``; None where they have no state."""
+        """Draw a sensor's offset; return the sensors' state at the start, None where sensors have no state."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
             self.xp.stack([zero] * len(self.channels)) if self.has_gaps else None,
@@ -156,7 +153,7 @@ class Receptions:
         return None if all(part is None for part in states) else states
 
     def _bias(self, draws: Draws, zero: Array) -> Array:
-        """Return the constant errors of all numbers, ``(m, N)``: an offset of one sensor, up or down."""
+        """Draw an offset of one sensor, up or down; return the constant errors of all numbers, ``(m, N)``."""
         biased = draws.integer("biased_sensor", (0, len(self.channels) - 1))
         sign = 2.0 * draws.integer("sign", (0, 1)) - 1.0
         size, rows = (self.parameters.bias * self.deviations).tolist(), []
@@ -168,14 +165,7 @@ class Receptions:
     def advance(
         self, states: SensorStates | None, interval: Array, uniforms: Array
     ) -> tuple[SensorStates | None, Array | None]:
-        """Return the sensors' state at a measurement, and 1 for each number received, else 0, ``(m, N)``; None if all
-        are.
-
-        Args:
-            states: state at the previous measurement.
-            interval: time since then, s, ``(N,)``.
-            uniforms: uniform numbers, ``(row_uniforms, N)``.
-        """
+        """Return the sensors' state at a measurement, and 1 for each number received, else 0, ``(m, N)``; None: all."""
         xp, here = self.xp, {channel.name: 1.0 + 0.0 * interval for channel in self.channels}
         if not (self.due or self.lossy or self.has_gaps):
             return states, None

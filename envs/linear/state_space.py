@@ -2,13 +2,11 @@ r"""A task made from a user's state-space model: its world and its class.
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
-f and Q of a timed model are functions of the interval dt since the previous measurement. A model may also have known
-inputs u, drawn with the episode, that acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
-measurement then contains both (:mod:`.equations`, :mod:`.inputs`).
+A timed model depends on the interval since the previous measurement, and may have known inputs, drawn with the
+episode, that acted in it (:mod:`.equations`, :mod:`.inputs`). A measurement then contains both.
 
 The world has one model, or switches between several as a Markov chain from measurement to measurement. The filters may
-use other models. The functions are traced once, on vectors of symbols, and differentiated exactly
-(:mod:`..compiler.vector_functions`).
+use other models. The functions are traced once, and differentiated exactly (:mod:`..compiler.vector_functions`).
 """
 
 from collections.abc import Sequence
@@ -44,7 +42,7 @@ from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
 class StateSpaceTruth(NamedTuple):
-    """True state, model, noise factors and inputs."""
+    """True state of a state-space world, such as current model, noise factors and inputs."""
 
     state: Array
     """True state, ``(n, N)``."""
@@ -64,7 +62,7 @@ class StateSpaceTruth(NamedTuple):
 
 
 class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
-    """World in which a state moves by one state-space model, or switches between several."""
+    """World of a state that moves by one state-space model, or switches between several."""
 
     parameters: StateSpaceParameters
     received_field: ClassVar[str] = "values"
@@ -110,7 +108,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Return the drawn truth (initial state, noise factors of the episode) and the initial estimate."""
+        """Draw initial state and noise factors; return this truth and the initial estimate."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -170,13 +168,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Return truth and measurement with some sensors' values delayed, and delayed values that arrive now added.
-
-        Args:
-            truth: truth at this measurement, with the delayed values of earlier ones.
-            received: values of all sensors.
-            uniforms: a uniform number for each sensor, ``(sensors, N)``.
-        """
+        """Return truth and measurement after delays: some values are held back, earlier delayed ones arrive."""
         xp, rows = self.xp, []
         for place, channel in enumerate(self.task.definition.channels):
             rows += [xp.where(uniforms[place] < self.parameters.late, 1.0, 0.0)] * channel.size
@@ -190,12 +182,10 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def _receive(
         self, truth: StateSpaceTruth, values: Array, here: Sequence[Array | None]
     ) -> tuple[Array, Array]:
-        """Return the received values of all sensors, zero elsewhere, and their availability, both ``(m, N)``.
+        """Return the received values of all sensors, with offset and wrapped angles, and their availability.
 
-        Args:
-            truth: truth at this measurement.
-            values: measured values, ``(m, N)``.
-            here: masks of 1 where values are received and 0 elsewhere, ``(N,)`` or ``(m, N)`` each.
+        Both are ``(m, N)``, values zero where not received. ``here`` are masks of 1 where values are received,
+        ``(N,)`` or ``(m, N)`` each.
         """
         available = 1.0 + 0.0 * values
         if truth.sensors is not None and truth.sensors.bias is not None:
@@ -209,21 +199,19 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return values, available
 
     def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
-        """Return the time until the next measurement, s, ``(N,)``; the sampling interval if the model is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
     def _inputs(
         self, truth: StateSpaceTruth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
-        """Return the inputs that act until the next measurement, and those that filters receive, ``(p, N)``."""
         if truth.inputs is None:
             return None, None
         inputs = self.input_processes.advance(truth.inputs, self._seconds(truth, interval), normals)
         return inputs, self.input_processes.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
-        """Return the random time until the next measurement, s, ``(N,)``; None if the model is not timed."""
+        """Draw the time until the next measurement, s, ``(N,)``; None if the model is not timed."""
         if not self.timed:
             return None
         interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
@@ -253,7 +241,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Return the standard deviations by the filters' R, ``(m, N)``; at the initial mean if R varies with x."""
+        """Return the standard deviations by the filters' R, ``(m, N)``; at the initial mean if R depends on x."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
@@ -278,7 +266,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """Return the index of the current model and the factors on Q and R, by name."""
+        """Return the index of the current model and the noise factors on Q and R, by name."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,
@@ -287,7 +275,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
 
 
 def measurement_indices(h: VectorFunction) -> list[int | None]:
-    """Return for each component the index of the number that measures it directly (a unit row of h), or None."""
+    """For each component return the index of the number that measures it directly (a unit row of h), or None."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
     rows = h.matrix.tolist()
@@ -350,12 +338,9 @@ def state_space_attributes(
     components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the class attributes of a task that follow from its state-space definition, by name.
+    """Return the class attributes of a task by name, from the definition of its state-space models.
 
-    Args:
-        definition: the models.
-        components: components of the state.
-        defaults: parameters of the training distribution that differ from the defaults of such tasks.
+    ``defaults`` are parameters of the training distribution that differ from the defaults of such tasks.
     """
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))

@@ -50,7 +50,7 @@ OFFSET = 5.0
 
 
 class ExtendedKalmanState(NamedTuple):
-    """State of an extended Kalman filter."""
+    """State of an extended Kalman filter: estimate, innovation statistics, last action and correction."""
 
     mean: Array
     """Mean, ``(n, N)``; predicted between ``predict`` and the action."""
@@ -72,7 +72,7 @@ class ExtendedKalmanState(NamedTuple):
 
 
 class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
-    """Base class of the banks with one extended Kalman filter."""
+    """Base class of the banks of one extended Kalman filter."""
 
     parameters: StateSpaceParameters
 
@@ -85,17 +85,17 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box [-1, 1] with one number for each entry of the action."""
+        """Gymnasium box [-1, 1] with one number for each component of the action."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
     def action_names(self) -> Sequence[str]:
-        """Names of the entries of the action, in order."""
+        """Names of the components of the action, in order; subclasses define them."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: normalised innovations, NIS, averages, availability, and the last action."""
+        """Observation blocks: innovation over sigma, NIS, its average, availability, the last action."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -111,7 +111,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         zero = 0.0 * initial.mean[0]
         return ExtendedKalmanState(
             initial.mean,
@@ -132,12 +132,12 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Return the state predicted to a measurement, with innovation statistics for the last action's noises."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        """Return the state predicted to a measurement, with innovation statistics under the last action."""
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Return the state with the innovation, NIS and log-likelihood of a measurement under its prediction."""
+        """Return the state with statistics of a measurement under its prediction, such as innovation and NIS."""
         xp = self.xp
         received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
@@ -157,12 +157,12 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
     def receive(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> Received:
-        """Return the innovation, H and R of the received numbers under the noises of an action."""
+        """Return innovation, H and R of the received numbers under an action."""
         R = self.sensor_noise(state.mean, measurement, action)
         return self.equations.receive(measurement, state.mean, R)
 
     def records(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """Return the log-likelihood, NIS and its degrees of freedom; NaN where nothing was received."""
+        """Return the log-likelihood, NIS and its degrees of freedom by name; NaN where nothing was received."""
         degrees = ordered_sum(measurement.available)
         there = degrees > 0.0
         return {
@@ -173,7 +173,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
 
 class StateSpaceNoiseBank(StateSpaceBank):
-    """Bank of the control ``noise``: the action scales Q and R."""
+    """Bank of the control ``noise``: the action scales Q and R of an extended Kalman filter."""
 
     action_names: Sequence[str] = ("process", "measurement")
 
@@ -200,11 +200,11 @@ class StateSpaceNoiseBank(StateSpaceBank):
 
 
 class StateSpaceGainBank(StateSpaceBank):
-    """Bank of the control ``gain``: the action multiplies the Kalman gain of each component."""
+    """Bank of the control ``gain``: the action multiplies the Kalman gain of each state component."""
 
     @property
     def action_names(self) -> Sequence[str]:
-        """Names of the components, one for each entry of the action."""
+        """Names of the state's components, one for each number of the action."""
         return tuple(component.name for component in self.task.components)
 
     def act(
@@ -220,7 +220,7 @@ class StateSpaceGainBank(StateSpaceBank):
 
 
 class StateSpaceKalmanNetBank(StateSpaceBank):
-    r"""The filter inside the learned estimator ``kalman-net``: a network sets noises, gain and motion.
+    r"""Bank of the learned estimator ``kalman-net``: a network sets noises, gain and motion of a filter.
 
     With D = diag(20^a) of n entries of the action, W = diag(20^a) of m, A = diag(5^a) of n, C = diag(5^a) of m, and
     b of n:
@@ -251,7 +251,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: those of one filter, the state, the last correction, and the log-deviations."""
+        """Observation blocks of one filter, and the state, the last correction and the log-deviations."""
         names = tuple(component.name for component in self.task.components)
         names = names if len(names) > 1 else ()
         xp = self.xp
@@ -286,7 +286,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
@@ -310,8 +310,8 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return outer(scale, scale) * matrix
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Return the state predicted with the last action's offset, with the innovation statistics."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        """Return the state predicted with the last action's offset, with innovation statistics."""
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
@@ -335,7 +335,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
 
 class Mixture(NamedTuple):
-    """State of an interacting multiple model."""
+    """State of an interacting multiple model (IMM): combined estimate, hypotheses, their probabilities."""
 
     mean: Array
     """Mean after an action, ``(n, N)``."""
@@ -361,8 +361,6 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
     """Bank of the control ``evidence``: an interacting multiple model (IMM) of extended Kalman filters.
 
     Args:
-        task: the problem.
-        control: name of the control.
         process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
         measurement_noise: factor on R of all hypotheses, a number or ``(N,)``.
         of_sources: factors on some terms of Q, by their names.
@@ -393,7 +391,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of probabilities, likelihoods, availability and the last action."""
+        """Observation blocks: NIS, likelihoods, predicted and posterior probabilities, availability, last action."""
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
@@ -418,7 +416,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def start(self, initial: Initial) -> Mixture:
-        """Return the state with all hypotheses at the initial estimate, equally probable."""
+        """Return the IMM's state at the start: all hypotheses at the initial estimate, equally probable."""
         xp, zero = self.xp, 0.0 * initial.mean[0]
         one = xp.stack([zero] * self.count)
         return Mixture(
@@ -434,13 +432,13 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
-        """Return the IMM's hypotheses mixed, predicted and updated with the measurement, independent of the action."""
+        """Return the hypotheses mixed, predicted and updated with the measurement; the action comes later."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
         updates = []
         for j, equations in enumerate(self.task.filter_equations):
-            mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
+            mean, carried = equations.predict_moments(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
             R = equations.sensor_noise(mean, measurement, *self.sensor_factors)
             received = equations.receive(measurement, mean, R)
@@ -454,11 +452,11 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def _align(self, means: Array) -> Array:
-        """Return the means ``(n, M, N)`` with angles shifted by whole turns next to the first hypothesis."""
+        """Return the means ``(n, M, N)`` with angles moved by whole turns next to the first hypothesis."""
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
-        """Return the hypotheses weighted with the evidence of the action and combined into one estimate."""
+        """Return the hypotheses weighted by Bayes' rule with the action's evidence, and combined."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -482,7 +480,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Return the bank classes and the descriptions of actions, each by control, the default control first."""
+    """Return the bank classes, and the descriptions of actions, by control, the default control first."""
     banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",

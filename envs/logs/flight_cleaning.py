@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Cleaning(NamedTuple):
-    """Site of the radar and limits of a flight; see :func:`~.flights.read_flights`."""
+    """Site of the radar and limits for the cleaning of a flight; see :func:`~.flights.read_flights`."""
 
     site: tuple[float, float] | None
     longest_gap: float
@@ -51,16 +51,13 @@ LONGEST_PAUSE = 1800.0
 def clean_flight(
     name: str, rows: "pandas.DataFrame", limits: Cleaning
 ) -> tuple[list[Trajectory], dict[str, int]]:
-    """Return the valid pieces of one recorded flight, and the counts of removed rows and cuts.
+    """Clean one recorded flight: return its valid pieces, and the counts of removed rows and cuts.
 
     Args:
-        name: name of the flight.
+        name: that of the flight.
         rows: table with the columns time (s), x, y (m), ground (true for rows on the ground), optionally vx, vy (m/s),
             and latitude and longitude if positions were given so.
         limits: limits of a flight.
-
-    Returns:
-        The pieces, and the counts of ``CLEANING_COUNTS``.
 
     Raises:
         ValueError: if the rows cannot be a flight, with the likely cause.
@@ -116,7 +113,6 @@ def clean_flight(
 
 
 def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
-    """Return the times ``(n,)``, positions and velocities ``(n, 2)`` of a flight's rows; velocities may be None."""
     # In the order of rows in memory, on which the last bit of a fit depends.
     pairs = [
         numpy.ascontiguousarray(rows[[*pair]].to_numpy())
@@ -133,7 +129,7 @@ FEWEST_IN_WINDOW = 5
 def fit_parabolas(
     time: numpy.ndarray, position: numpy.ndarray, half_width: float
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return position and velocity of the parabolas fitted by least squares around each time.
+    """Return position and velocity of parabolas fitted by least squares to the positions around each time.
 
     Args:
         time: s, ``(n,)``, n >= ``FEWEST_IN_WINDOW``.
@@ -163,7 +159,6 @@ def fit_parabolas(
 def _check_units(
     time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: Cleaning
 ) -> None:
-    """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
     check_speed(time, position, limits.speeds)
     step = float(numpy.median(numpy.diff(time)))
     if step > limits.longest_gap:

@@ -19,11 +19,11 @@ from ..data.clock import SINCE_1970, time_unit
 from ..data.foreign_files import (
     MOST_NUMBERS,
     limits,
+    memory_limit_error,
     open_foreign,
     parse_apart,
     parse_json,
     read_content,
-    refuse_memory,
 )
 from ..data.foreign_parsers import MOST_COLUMNS, check_cells, check_column_names, check_rows
 from .receiver_logs import RECEIVER_READERS, receiver_columns
@@ -86,7 +86,7 @@ UNITS: Mapping[str, tuple[str, ...]] = {
 
 
 class FlightTable(NamedTuple):
-    """Columns, names and notes from a file."""
+    """Columns read from a file, names of all its columns, and notes."""
 
     columns: "pandas.DataFrame"
     """Known columns by their names in lower case; empty cells are missing values."""
@@ -97,12 +97,12 @@ class FlightTable(NamedTuple):
 
 
 class ColumnNames(frozenset[str]):
-    """Names of the columns that are read, in lower case, and the prefix of further ones, if there is one."""
+    """Set of the names of columns to read, in lower case, and a prefix of further ones."""
 
     prefix: str
 
     def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
-        """Return a set of the names, with a prefix of further names."""
+        """Return a set of names, and a prefix of further ones."""
         found = super().__new__(cls, names)
         found.prefix = prefix
         return found
@@ -112,7 +112,7 @@ class ColumnNames(frozenset[str]):
 
     @property
     def request(self) -> dict[str, Any]:
-        """The names and the prefix as arguments of a parser in a subprocess."""
+        """Names and prefix as arguments of a parser in a subprocess."""
         return {"names": sorted(self), "prefix": self.prefix}
 
 
@@ -141,11 +141,6 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
-    """Yield the lines of a text, none of which may exceed ``LONGEST_LINE``.
-
-    Raises:
-        ValueError: for a line longer than ``LONGEST_LINE``.
-    """
     while line := text.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
             raise ValueError(f"it has a line of more than {LONGEST_LINE:,} characters, and no row is so long")
@@ -153,7 +148,7 @@ def _bounded_lines(text: TextIO) -> Iterator[str]:
 
 
 def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
-    """Return the cells with decimal points, if the column has commas and no points."""
+    """Return the cells with decimal points in place of commas, if the column has no points."""
     if not any("," in cell for cell in cells) or any("." in cell for cell in cells):
         return cells
     return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in cells]
@@ -186,7 +181,7 @@ def _is_hdf(file: Path) -> bool:
 
 
 def netcdf_attribute_names(file: Path) -> list[str]:
-    """Return the names of the attributes of a NetCDF file.
+    """Return the names of the attributes in a NetCDF file.
 
     Raises:
         ValueError: if the file is not NetCDF, or needs a package that is not installed.
@@ -198,7 +193,6 @@ def netcdf_attribute_names(file: Path) -> list[str]:
 
 
 def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
-    """Return the content of a NetCDF file as a dataset, without decoding."""
     import xarray
 
     if not _is_hdf(file):
@@ -231,7 +225,6 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
 
 
 def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return attributes by name, with arrays of one number as that number."""
     return {
         name: value[()] if isinstance(value, numpy.ndarray) and value.ndim == 0 else value
         for name, value in pairs
@@ -290,7 +283,7 @@ def _json(file: Path, known: ColumnNames) -> FlightTable:
     with open_foreign(file, limits().memory) as content:
         text = (gzip.GzipFile(fileobj=content) if file.suffix == ".gz" else content).read(most + 1)
     if len(text) > most:
-        raise refuse_memory(f"its text has more than {most / 1e6:,.0f} MB")
+        raise memory_limit_error(f"its text has more than {most / 1e6:,.0f} MB")
     rows = parse_json(text)
     # A list of rows, or columns, each with the numbers of its rows.
     parts = list(rows.values()) if isinstance(rows, dict) else rows
@@ -328,7 +321,7 @@ def suffix_of(file: Path) -> str:
 
 
 def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTable:
-    """Return the known columns of a file, the names of all its columns, and notes.
+    """Read a table from a file: return its known columns, the names of all columns, and notes.
 
     Args:
         file: path with one of ``FLIGHT_SUFFIXES``.
@@ -358,7 +351,7 @@ def list_names(names: Sequence[str], most: int = 20) -> str:
 
 
 def flight_columns(table: FlightTable) -> tuple["pandas.DataFrame", bool]:
-    """Return the columns of a flight by their standard names, and whether altitudes are in feet.
+    """Return the columns of a flight under their standard names, and whether altitudes are in feet.
 
     Raises:
         ValueError: if a column is missing.
@@ -415,7 +408,6 @@ def is_true(values: "pandas.Series") -> "pandas.Series":
 
 
 def _rewrite_date(date: Any) -> str:
-    """Return a date in ISO 8601 if it has another unambiguous form, otherwise unchanged."""
     word = re.sub(r"(:\d{2}),(\d)", r"\1.\2", str(date).strip())
     found = DATE.match(word)
     if found is None:
@@ -425,11 +417,6 @@ def _rewrite_date(date: Any) -> str:
 
 
 def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
-    """Return the times of day in seconds, continued through midnight.
-
-    Raises:
-        ValueError: for a value that is no time of day.
-    """
     found = values.map(CLOCK.fullmatch)
     if found.isna().any():
         row = found.isna().idxmax()
@@ -476,7 +463,7 @@ def describe_time(clock: str, time: float) -> str:
 
 
 def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> None:
-    """Raise ValueError for times that decrease, with both times and advice.
+    """Raise ValueError, with advice, if times decrease.
 
     Args:
         time: s, ``(rows,)``.
@@ -499,14 +486,14 @@ def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> No
 
 
 def _counter_turn(step: float) -> float | None:
-    """Return the range of the counter that wraps around at a step of time, s; None for other steps."""
+    """Return the range of a counter that wraps around at a step of time, s; None for other steps."""
     return next((turn for turn in COUNTERS if abs(step + turn) < COUNTER_SHARE * turn), None)
 
 
 def sort_by_time(
     table: "pandas.DataFrame", times: "pandas.Series", group: numpy.ndarray | None = None
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Return the rows of a table sorted by time, unless a counter wraps around, and a note on rows out of order.
+    """Return a table's rows sorted by time, unless a counter wraps around, and a note on rows out of order.
 
     Args:
         table: rows, numbered from zero.
@@ -529,7 +516,7 @@ def sort_by_time(
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":
-    """Return the times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
+    """Return times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
 
     Times of day that decrease by more than half a day are those of the next day. Dates are ISO 8601, with an offset
     from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970
@@ -548,11 +535,7 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
 
 
 def _parse_times(values: "pandas.Series") -> tuple["pandas.Series", float]:
-    """Return dates, time differences, or numbers, and the number of these units in a second.
-
-    Raises:
-        ValueError: for a value that is no time.
-    """
+    """Return the dates, time differences or numbers in a column, and how many of these units are a second."""
     import pandas
 
     types = pandas.api.types

@@ -1,13 +1,11 @@
 """Recorded flights from files: read by column names, projected to the radar's plane, cleaned and cut into pieces.
 
-:mod:`.flight_tables` lists the accepted columns. Latitude and longitude become metres east and north of the
-radar's site, in the plane that touches the ellipsoid there. The package has its own
-projection, because it is a rotation of Earth-fixed coordinates that the satellites need anyway; the tests compare it
-with a geodesy library.
+:mod:`.flight_tables` lists the accepted columns. Latitude and longitude become metres east and north of the radar's
+site, in the plane that touches the ellipsoid there.
 
-Every file is checked (:mod:`.flight_cleaning`): a flight with an impossible speed is an error with the likely cause, a
-single position far off the track is removed, and a track is cut where it jumps or has a long gap. A note of one line a
-file lists these changes.
+:mod:`.flight_cleaning` checks every file: a flight with an impossible speed is an error with the likely cause, a
+single position far off the track is removed, and a track is cut where it jumps or has a long gap. Notes list these
+changes.
 """
 
 import difflib
@@ -45,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class FlightSource(NamedTuple):
-    """One file, or one trajectory of a sequence, with notes on its use."""
+    """One file, or one trajectory of a sequence, with the flights in it and notes on their use."""
 
     name: str
     trajectories: tuple[Trajectory, ...]
@@ -57,7 +55,7 @@ class FlightSource(NamedTuple):
 
 @dataclass(frozen=True)
 class Flights(FlightData):
-    """A set of flights, of which every episode replays one, drawn with equal probability.
+    """Set of recorded flights, of which every episode flies one, drawn with equal probability.
 
     Args:
         trajectories: the pieces that can be flown.
@@ -93,16 +91,7 @@ class Flights(FlightData):
         return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 
     def flyable(self, interval: float, farthest: float) -> tuple[list[Trajectory], list[str]]:
-        """Return the pieces within range that are long enough, and a note for each source that was shortened or
-        dropped.
-
-        Args:
-            interval: sampling interval, s.
-            farthest: largest distance from the radar, m.
-
-        Raises:
-            ValueError: if no piece can be flown.
-        """
+        """Return the pieces of flights within range and long enough, and a note for each source with a loss."""
         used, lines = [], []
         for source in self.sources:
             kept, dropped = [], 0
@@ -135,12 +124,11 @@ class Flights(FlightData):
 
 
 def flight_of(trajectory: Trajectory) -> str:
-    """Return the name of the flight of which a trajectory is a piece, or its own name."""
+    """Return the name of the flight of which a trajectory is a piece, or else its own name."""
     return trajectory.flight or trajectory.name
 
 
 def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories with numbers appended to the names of different flights with the same name."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
         replace(trajectory, name=f"{trajectory.name} {i}")
@@ -201,7 +189,7 @@ TRAFFIC = "traffic:"
 def traffic_samples() -> dict[str, Path]:
     """Return the sample files of the Python package ``traffic`` by name; empty if it is not installed.
 
-    The package is not imported: that would import many libraries, and the samples are JSON.
+    The package, which needs many libraries, is not imported.
     """
     found = importlib.util.find_spec("traffic")
     folders = list(found.submodule_search_locations or ()) if found else []
@@ -213,11 +201,6 @@ def traffic_samples() -> dict[str, Path]:
 
 
 def _traffic_sample(name: str) -> Path:
-    """Return the path of a sample in the package ``traffic``.
-
-    Raises:
-        ValueError: if there is no such sample, or no such package.
-    """
     samples = traffic_samples()
     if not samples:
         raise ValueError(
@@ -232,7 +215,7 @@ def _traffic_sample(name: str) -> Path:
 
 
 def files_of(source: str | Path) -> list[Path]:
-    """Return the files of a path, folder or pattern, in the order of their names.
+    """Return the files of a path, folder or pattern, sorted by name.
 
     Raises:
         ValueError: if it is no path, or matches no files.
@@ -355,11 +338,6 @@ def _check_site(site: Any) -> tuple[float, float] | None:
 
 
 def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[FlightSource]:
-    """Return the flights of one file as sources, with a reason for every flight that cannot be used.
-
-    Raises:
-        ValueError: if nothing of it can be used.
-    """
     try:
         table = read_table(file)
     except ValueError as error:
@@ -436,7 +414,6 @@ def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:
 
 
 def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Return the rows of every flight by name, sorted by time; a single unsorted group if the file has no names."""
     if flight is None:
         return {"": rows}
     names = flight.astype(object).where(flight.notna(), "").astype(str).str.strip()
@@ -455,7 +432,6 @@ def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -
 
 
 def _around(site: tuple[float, float], rows: "pandas.DataFrame") -> "pandas.DataFrame":
-    """Return the rows of one flight with x and y, m east and north of a site, added."""
     latitude, longitude = (numpy.radians(rows[name].to_numpy()) for name in ("latitude", "longitude"))
     altitude = numpy.zeros_like(latitude)
     if "altitude" in rows:

@@ -27,7 +27,7 @@ LONGEST_GAP = 1.0
 
 
 class OnboardTrack(NamedTuple):
-    """Positions that a vehicle's own filter estimated."""
+    """Positions by time that a vehicle's own filter estimated, and their source."""
 
     source: str
     """Filter, autopilot and topic, as text."""
@@ -39,9 +39,7 @@ class OnboardTrack(NamedTuple):
     """Longitude, degrees, ``(n,)``."""
 
     def at(self, time: numpy.ndarray, origin: PlaneOrigin) -> numpy.ndarray:
-        """Return positions east and north of an origin at some times, m, ``(..., 2)``; NaN where there is no estimate
-        within ``LONGEST_GAP``.
-        """
+        """Return positions east and north of an origin at times, m, ``(..., 2)``; NaN in gaps over ``LONGEST_GAP``."""
         place = origin.east_north(self.latitude, self.longitude, numpy.full(len(self.time), numpy.nan))
         after = numpy.clip(numpy.searchsorted(self.time, time), 1, len(self.time) - 1)
         near = self.time[after] - self.time[after - 1] <= LONGEST_GAP
@@ -50,7 +48,7 @@ class OnboardTrack(NamedTuple):
 
 
 def read_onboard(path: Any) -> OnboardTrack | None:
-    """Return the track that the vehicle's filter estimated; None for other files, or a log without estimates.
+    """Return the track that the vehicle's own filter estimated, from an autopilot's log; None if there is none.
 
     Raises:
         ValueError: if the log of an autopilot cannot be read.
@@ -67,7 +65,7 @@ def read_onboard(path: Any) -> OnboardTrack | None:
 
 
 def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
-    """Return the track of a PX4 log: the inverse of the azimuthal equidistant projection of its ``map_projection``."""
+    """Return the track of a PX4 log: the inverse of its azimuthal equidistant ``map_projection``."""
     valid = fields.get("xy_valid", numpy.ones(len(fields["timestamp"]))) > 0
     # Time of the sample of the estimate; its publication is some ms later.
     time, x, y, latitude, longitude = (

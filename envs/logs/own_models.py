@@ -32,12 +32,7 @@ SIMULATION_PARAMETERS = (
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Return the :class:`LogFormat` of a state-space model.
-
-    Args:
-        definition: the models.
-        defaults: parameters of the task.
-    """
+    """Return the :class:`LogFormat` of the tables of a state-space model."""
     one = len(definition.filters) == 1
     columns = {name.lower(): unit for name, unit in definition.measured.items()}
     acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
@@ -64,11 +59,6 @@ def _read(
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
-    """Return the measurements of one track from the columns of a table.
-
-    Raises:
-        ValueError: if a column is missing or a value is not possible.
-    """
     names, inputs = ([name.lower() for name in part] for part in (definition.measured, definition.inputs))
     lacking = [name for name in (*names, *inputs) if not columns.has(name)]
     if lacking:
@@ -109,7 +99,6 @@ def _read(
 def _check_noise(
     definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
 ) -> None:
-    """Raise ValueError for a row that makes a sensor's R not positive definite, such as an accuracy of zero."""
     count = len(rows)
     interval = made.get("interval", numpy.full(count, usual))
     inputs = made.get("inputs", numpy.zeros((count, 0)))
@@ -125,11 +114,7 @@ def _check_noise(
 
 
 def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
-    """Return an input at every measurement, ``(T,)``, with empty cells filled forward, then backward.
-
-    Raises:
-        ValueError: if no row has a value.
-    """
+    """Return an input at every measurement, ``(T,)``, with empty cells filled forward, then backward."""
     there = numpy.isfinite(given)
     if not there.any():
         raise ValueError(f"no row has a value of {name}")
@@ -139,11 +124,7 @@ def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray
 
 
 def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the row of every measurement at a fixed interval, -1 where there is none, and the times, s.
-
-    Raises:
-        ValueError: for rows that are not whole intervals apart.
-    """
+    """Return the row of every measurement at a fixed interval, -1 where there is none, and the times, s."""
     steps = numpy.rint(numpy.diff(time) / interval)
     wrong = (numpy.abs(numpy.diff(time) - steps * interval) > UNEVEN * interval) | (steps < 1.0)
     wrong |= steps > MOST_MISSED
@@ -161,7 +142,7 @@ def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, num
 
 
 def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any) -> TrackStart:
-    """Raise ValueError: a track starts from the mean and covariance of the model."""
+    """Raise ValueError: a track of a state-space model starts from the model's mean and covariance."""
     raise ValueError(
         "it lacks initial_mean and initial_covariance, and the model does not start from measurements"
     )

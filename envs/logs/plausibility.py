@@ -1,8 +1,8 @@
 """Plausibility checks of tracks in files: units, clocks, and positions that no target can reach.
 
 Flights (:mod:`.flight_cleaning`) and recordings (:func:`check_recording`) use these checks. Impossible values raise an
-error of one sentence with the likely cause. Possible but noteworthy values give a note. The checks never change or drop
-rows of a recording, because a sensor may have measured them.
+error with the likely cause; noteworthy ones give a note. No row of a recording is changed or dropped, because a sensor
+may have measured it.
 """
 
 import difflib
@@ -75,7 +75,7 @@ def check_speed(
     sigma: float = 0.0,
     moving: bool = True,
 ) -> None:
-    """Raise ValueError if positions in metres and times in seconds give an impossible speed.
+    """Raise ValueError if positions taken as metres and times as seconds give an impossible speed.
 
     Args:
         time: s, ``(n,)``, increasing.
@@ -151,7 +151,7 @@ def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velo
 
 
 def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
-    """Raise ValueError for angles beyond ``most`` degrees."""
+    """Raise ValueError for angles beyond +-``most`` degrees."""
     largest = float(numpy.nanmax(numpy.abs(values), initial=0.0))
     if largest > most:
         cause = ": is it metres?" if largest > 1000.0 else ""
@@ -191,13 +191,7 @@ def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma:
 
 
 def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarray) -> None:
-    """Raise ValueError if one of two series of the same positions is in metres and the other in kilometres.
-
-    Args:
-        names: names of the series.
-        one: ``(n, k)``, NaN where there is no position.
-        other: ``(n, k)``, NaN where there is no position.
-    """
+    """Raise ValueError if one of two series of the same positions is in metres and the other in kilometres."""
     extents = [
         _length(numpy.nanmax(values, axis=0) - numpy.nanmin(values, axis=0)) for values in (one, other)
     ]
@@ -220,7 +214,7 @@ def check_interval(step: float, longest: float) -> None:
 def find_outliers(
     time: numpy.ndarray, position: numpy.ndarray, reach: Callable[[numpy.ndarray], Any]
 ) -> numpy.ndarray:
-    """Return the mask ``(n,)`` of positions too far from both neighbours, which are near each other.
+    """Return the mask ``(n,)`` of positions that are too far from both neighbours, which are near each other.
 
     Args:
         time: s, ``(n,)``.
@@ -239,9 +233,9 @@ def find_outliers(
 
 
 def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the deviations of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
+    """Return the distance of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
 
-    The deviations are scaled to the variance of the noise of the values.
+    It is scaled to the variance of the noise of the values.
     """
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, None]
     line = before * values[:-2] + (1.0 - before) * values[2:]
@@ -249,7 +243,7 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
-    """Return the standard deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3.
+    """Estimate the standard deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3.
 
     It is estimated from the median distance to the line through the neighbours, and not below the resolution of 64-bit
     numbers of that size.
@@ -259,7 +253,7 @@ def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
 
 
 def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint: str = "") -> list[str]:
-    """Return the notes on columns of a table that are not read, warnings first.
+    """Return notes on the columns of a table that are not read, warnings first.
 
     Args:
         names: names of the columns, in lower case.
@@ -306,19 +300,9 @@ def _is_noise(name: str) -> bool:
 
 
 def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, float]) -> list[str]:
-    """Return notes on every episode of a recording; raise ValueError for impossible values.
+    """Return notes on the plausibility of every episode of a recording; ValueError for impossible values.
 
-    Args:
-        recording: the recording.
-        task: the task that replays it.
-        speeds: lowest and highest possible speed, m/s; the lowest holds where targets always
-            move, see :class:`.LogFormat`.
-
-    Returns:
-        Notes, one line each.
-
-    Raises:
-        ValueError: for the first episode with impossible values.
+    ``speeds`` are the lowest and highest possible speed, m/s; the lowest holds where targets always move.
     """
     world: Any = task.world  # a RecordedWorld
     # Latitude and longitude have a known unit, and their receiver may stand still.
@@ -359,13 +343,12 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
 
 
 def limit_notes(notes: list[str]) -> list[str]:
-    """Return the first ``MOST_NOTES`` notes and the number of the others."""
+    """Return the first ``MOST_NOTES`` notes, and one with the number of the others."""
     more = [f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)
     return [*notes[:MOST_NOTES], *more]
 
 
 def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) -> None:
-    """Raise ValueError if true velocities disagree with the differences of true positions."""
     pairs = [
         (i, names.index(rate))
         for i, name in enumerate(names)
@@ -381,7 +364,6 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
-    """Raise ValueError if the truth is much farther from the measurements than their deviations."""
     known = numpy.isfinite(truth).all(axis=1)
     if not known.any():
         return
@@ -401,7 +383,6 @@ def _check_scale(
     moving: bool,
     known_unit: bool,
 ) -> None:
-    """Raise ValueError if measured positions cannot be metres, by their speed and their noise."""
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
     if len(time) < FEWEST or known_unit:
         return
@@ -424,18 +405,7 @@ def _check_scale(
 def _notes(
     time: numpy.ndarray, position: numpy.ndarray, sigma: numpy.ndarray, number: numpy.ndarray, moving: bool
 ) -> list[str]:
-    """Return notes on the measured positions of one episode.
-
-    Args:
-        time: s, ``(n,)``.
-        position: m, ``(n, k)``.
-        sigma: stated standard deviation, m, ``(n,)``.
-        number: number of each measurement.
-        moving: whether the target cannot stand still.
-
-    Raises:
-        ValueError: if the clock jumped and the target did not.
-    """
+    """Return notes on the measured positions of one episode; ValueError if the clock jumped, not the target."""
     moved, steps = _length(numpy.diff(position, axis=0)), numpy.diff(time)
     step, error, notes = float(numpy.median(steps)), float(numpy.median(sigma)), []
     half = len(position) // 2

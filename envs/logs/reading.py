@@ -29,7 +29,7 @@ def read_recording(
     sort: bool = False,
     **keywords: Any,
 ) -> Recording:
-    """Return recorded measurements read from files, after a check of their plausibility (:mod:`.plausibility`).
+    """Read recorded measurements from files, and check their plausibility (:mod:`.plausibility`).
 
     Args:
         path: a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; a table (CSV,

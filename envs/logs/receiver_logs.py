@@ -7,10 +7,9 @@
 * Bags of ROS 1, ``.bag``, and of ROS 2, ``.db3`` or ``.mcap``: ``NavSatFix``, with ``Odometry`` for a second sensor, or
   positions of ``Odometry`` or of poses.
 
-Each becomes a table with those of ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x`` and ``sigma_y`` that
-the log contains, or with ``x`` and ``y`` of a baseline. The libraries for the last four are imported when such a file
-is read. The readers use files as data only, never code, types or paths in them, and reject a file that is too large
-before it fills the memory.
+Each becomes a table with those of ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x`` and ``sigma_y``
+that the log contains, or with ``x`` and ``y`` of a baseline. The readers use files as data only, never code, types or
+paths in them, and reject a file that is too large before it fills the memory.
 """
 
 import datetime
@@ -40,7 +39,7 @@ WEEK = 7 * DAY
 
 
 class ReceiverLog(NamedTuple):
-    """Columns and notes from a log."""
+    """Columns read from a receiver's log, and notes."""
 
     columns: Mapping[str, Any]
     """Columns by name, all of the same length."""
@@ -49,16 +48,11 @@ class ReceiverLog(NamedTuple):
 
 
 def count_of(count: int, what: str, plural: str = "") -> str:
-    """Return a count with its noun; the plural is formed with s unless given."""
+    """Return a count with its noun, whose plural has an s unless given."""
     return f"{count:,} {what if count == 1 else plural or what + 's'}"
 
 
 def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
-    """Return a note on the number of skipped lines; raise ValueError if most are broken.
-
-    Raises:
-        ValueError: if most lines are broken.
-    """
     if count > MOST_BROKEN * (count + good):
         raise ValueError(f"{count_of(count, 'line')} of {count + good:,} {what}: is it whole?")
     return (f"{count_of(count, 'line')} {what}: left out",) if count else ()
@@ -77,10 +71,10 @@ QUALITY = ("none", "fixed", "float", "SBAS", "DGPS", "single", "PPP")
 
 
 def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
-    """Return the columns of an RTKLIB solution file (manual 2.4.2, B.1).
+    """Return positions and standard deviations from an RTKLIB solution file (manual 2.4.2, B.1), as columns.
 
     Args:
-        file: path of the log.
+        file: its path.
         most_rows: largest number of rows.
 
     Raises:
@@ -131,14 +125,13 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
-    """Return date and time as written; for a GPS week and seconds, no date and the seconds since 1980."""
+    """Return date and time as written, and 0; of a GPS week and seconds no date, and the seconds since 1980."""
     if "/" in cells[0]:
         return f"{cells[0]} {cells[1]}", 0.0
     return "", WEEK * int(cells[0]) + float(cells[1])
 
 
 def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the columns of positions and standard deviations, and notes on them."""
     if {"latitude", "longitude"} <= {*found}:
         columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
         if "height" in found:
@@ -171,12 +164,9 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
 
 
 def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
-    """Return the standard deviations east and north from Earth-fixed ones, m, by name.
+    """Return standard deviations east and north, m, by name, from Earth-fixed ones at an origin (rad).
 
-    Args:
-        sigmas: standard deviations of x, y, z, and signed roots of the covariances xy, yz, zx, m, ``(6, n)``.
-        latitude: of the origin, rad.
-        longitude: of the origin, rad.
+    ``sigmas``, ``(6, n)``, are of x, y, z, and signed roots of the covariances xy, yz, zx.
     """
     xx, yy, zz, xy, yz, zx = numpy.sign(sigmas) * sigmas**2
     covariance = numpy.array([[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]])
@@ -193,8 +183,6 @@ SENTENCE = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST),[^\r\n$]*")
 
 
 class _Epoch:
-    """Contents of the NMEA sentences of one time."""
-
     def __init__(self, time: float) -> None:
         self.time = time
         self.date: datetime.date | None = None
@@ -206,10 +194,10 @@ class _Epoch:
 
 
 def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
-    """Return the columns of a file of NMEA 0183 sentences GGA, RMC and GST; skip other sentences.
+    """Return positions and standard deviations from NMEA 0183 sentences GGA, RMC and GST, as columns.
 
     Args:
-        file: path of the log; lines may begin with other text, such as a time of the logger.
+        file: its path; lines may begin with other text, such as a time of the logger.
         most_rows: largest number of rows.
 
     Raises:
@@ -252,12 +240,6 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
-    """Add the contents of an NMEA sentence to the epoch of its time.
-
-    Raises:
-        ValueError: if a field is no number, or there is no position.
-        AttributeError: if the sentence has no time.
-    """
     clock: datetime.time = message.timestamp
     time = 3600.0 * clock.hour + 60.0 * clock.minute + clock.second + 1e-6 * clock.microsecond
     kind = message.sentence_type
@@ -282,7 +264,6 @@ def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
 
 
 def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
-    """Return the date of every epoch from those that contain one; None if none does."""
     known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
     if known is None:
         return [None] * len(epochs)
@@ -299,13 +280,11 @@ def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
 
 
 def _format_time(time: float, day: datetime.date | None) -> str:
-    """Return the time of day as text, with its date if known."""
     clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
     return clock if day is None else f"{day.isoformat()}T{clock}Z"
 
 
 def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
-    """Return the standard deviations east and north, with gaps filled forward, then backward."""
     import pandas
 
     stated = pandas.DataFrame(
@@ -318,12 +297,12 @@ def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, nump
 
 
 def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
-    """Return the columns of the receiver's positions in a log of PX4.
+    """Return the receiver's positions from a log of PX4 (ULog), as columns.
 
     Reading: ``eph`` is the standard deviation of the distance in the plane, so that of each axis is ``eph / sqrt(2)``.
 
     Args:
-        file: path of the log.
+        file: its path.
         most_rows: largest number of rows.
 
     Raises:
@@ -333,7 +312,6 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     data = log["fields"]
 
     def column(*names: tuple[str, float]) -> Any:
-        """Return the first of some fields that the log has, times its unit."""
         return next((data[name] * unit for name, unit in names if name in data), None)
 
     places = {
@@ -356,13 +334,11 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _autopilot_notes(topic: str, fixed: numpy.ndarray) -> tuple[str, ...]:
-    """Return the notes on positions in the log of an autopilot, of which some have a fix, booleans ``(rows,)``."""
     source = f"positions are of {topic}, times seconds since the start of the autopilot"
     return (source, *_missing_fixes(fixed, "row"))
 
 
 def _missing_fixes(fixed: numpy.ndarray, noun: str) -> tuple[str, ...]:
-    """Return a note on how many rows or messages have no fix; none if all have one."""
     return () if fixed.all() else (f"{count_of(int((~fixed).sum()), noun)} without a fix",)
 
 
@@ -372,13 +348,13 @@ DATAFLASH_SUFFIXES = (".bin", ".BIN")
 
 
 def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
-    """Return the columns of the first receiver's positions in a log of ArduPilot.
+    """Return the first receiver's positions from a log of ArduPilot, as columns.
 
     Reading: ``HAcc`` of ``GPA`` is the standard deviation of the distance in the plane. Altitudes are above the sea:
     some tens of metres move a position in the plane by 1e-5 of its distance.
 
     Args:
-        file: path of the log.
+        file: its path.
         most_rows: largest number of rows.
 
     Raises:
@@ -403,13 +379,13 @@ UNKNOWN_COVARIANCE, NO_FIX = 0, -1
 
 
 def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
-    """Return the columns of positions in a bag of ROS 1 or a storage file of ROS 2, of the largest topic.
+    """Return the positions of the largest topic in a bag of ROS 1 or a storage file of ROS 2, as columns.
 
     The positions are ``NavSatFix``, with displacements of ``Odometry`` for a second sensor; without them, positions of
     ``Odometry`` or of poses, metres in their own frame.
 
     Args:
-        file: path of the bag.
+        file: its path.
         most_rows: largest number of rows.
 
     Raises:
@@ -423,7 +399,6 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the columns of ``NavSatFix`` messages from the values ``(8, n)`` of :func:`.parse_bag`."""
     time, status, latitude, longitude, altitude, east, north, covariance_type = values
     fixed = status != NO_FIX
     columns = {"time": time, "altitude": altitude}
@@ -439,7 +414,6 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the columns of poses from the values ``(5, n)`` of :func:`.parse_bag`."""
     time, x, y, *variances = values
     columns = {"time": time, "x": x, "y": y}
     notes = (f"positions are of the topic {topic}, metres in its own frame",)
@@ -450,7 +424,6 @@ def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the log with displacements since the previous row added, from poses ``(5, n)`` of :func:`.parse_bag`."""
     order = numpy.argsort(values[0], kind="stable")
     time, x, y, *_ = values[:, order]
     now = log.columns["time"]
@@ -477,10 +450,10 @@ RECEIVER_READERS: Mapping[str, Callable[[Path, int], ReceiverLog]] = {
 
 
 def receiver_columns(file: Path, suffix: str, most_rows: int) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Return the columns of a receiver log, and notes on the reading.
+    """Return the columns of a receiver's log of any format as a table, and notes on the reading.
 
     Args:
-        file: path of the log.
+        file: its path.
         suffix: one of ``RECEIVER_READERS``.
         most_rows: largest number of rows.
 

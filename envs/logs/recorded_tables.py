@@ -1,8 +1,8 @@
 """Readers that turn tables of real measurements into recordings.
 
-An environment declares its columns and makes measurements of them (:class:`.LogFormat`). This module handles the
-parts common to all tables: times, missing values, duplicate rows, several recordings in one file, latitude and
-longitude, and true values, ``truth_NAME`` for the components of the environment.
+An environment declares its columns and makes measurements of them (:class:`.LogFormat`). Common to all tables are
+times, missing values, duplicate rows, several recordings in one file, latitude and longitude, and true values,
+``truth_NAME``.
 """
 
 import difflib
@@ -19,7 +19,7 @@ from ..contract.live_input import LARGEST
 from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog, check_deviations
 from ..contract.task import Component, Task
 from ..data.recorded_world import measure_once
-from ..data.recording import Recording, side_by_side
+from ..data.recording import Recording, stack_recordings
 from .flight_tables import (
     COLUMNS,
     FLIGHT_SUFFIXES,
@@ -50,13 +50,12 @@ UNEVEN = 0.01
 
 
 class Columns:
-    """Columns of one recording, in the order of its times.
+    """Columns of one recording in a table, sorted by time.
 
     Args:
-        name: name of the recording.
         table: numbers by column name, NaN where a cell is empty, with ``time`` in seconds. Its index
             counts the rows of the file.
-        given: parameters that the user has set.
+        user_parameters: parameters that the user has set.
         log_time: times as written in the file, numbers or text, ``(rows,)``; default: those of the table.
     """
 
@@ -91,21 +90,18 @@ class Columns:
         return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column, ``(rows,)``; NaN where a cell is empty."""
         return self.table[name].to_numpy()
 
     def place(self, number: int) -> str:
-        """Return the place of a row in the file, such as ``row 12``."""
+        """Return the place of a row in the file as text, such as ``row 12``."""
         return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
-        """Return a copy of the columns with only some of the rows."""
+        """Return a copy of the columns with only these rows."""
         return Columns(self.name, self.table[rows], self.user_parameters, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
-        """Merge rows of one time that fill each other's empty cells, and drop other rows of the same time.
-
-        The method drops all other rows with the time of the previous row, and notes how many.
+        """Merge rows of one time that fill each other's empty cells, drop further rows of that time, and note how many.
 
         Raises:
             ValueError: if many of them have other values than the previous row.
@@ -151,9 +147,9 @@ class Columns:
         self.table, self.log_time = whole[kept], self.log_time[kept]
 
     def project_to_plane(self, plane: tuple[str, ...]) -> None:
-        """Convert latitude and longitude to metres east and north, and note the origin.
+        """Replace latitude and longitude by metres east and north of the first position; note the origin.
 
-        The plane touches the ellipsoid at the first position.
+        The plane touches the ellipsoid there.
 
         Args:
             plane: names of the new columns, see :attr:`.LogFormat.plane`.
@@ -199,11 +195,7 @@ class Columns:
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
 
     def note_turns(self, angles: Collection[str]) -> None:
-        """Add a note if true values jump by a whole turn although their component is no declared angle.
-
-        Args:
-            angles: columns of the declared angles.
-        """
+        """Add a note if true values jump by a whole turn, although they are not among the declared ``angles``."""
         for name in (name for name in self.true if name not in angles):
             steps = numpy.abs(numpy.diff(self[name]))
             for unit, period in PERIODS.items():
@@ -215,7 +207,7 @@ class Columns:
                     )
 
     def _drop_null_positions(self, latitude: str, longitude: str) -> None:
-        """Replace positions at latitude 0 and longitude 0, which receivers write without a fix, with NaN."""
+        """Replace positions at latitude and longitude 0, which receivers write without a fix, by NaN."""
         null = ((self.table[latitude] == 0.0) & (self.table[longitude] == 0.0)).to_numpy()
         if not null.any():
             return
@@ -229,11 +221,7 @@ class Columns:
         )
 
     def note_offset(self, plane: tuple[str, ...]) -> None:
-        """Add a note if a clock offset of the truth would reduce its distance to the measurements.
-
-        Args:
-            plane: names of the columns, see :attr:`.LogFormat.plane`.
-        """
+        """Add a note if a clock offset of the truth would bring it nearer to the measurements in ``plane``."""
         if self.has(*plane):
             x, y, true_x, true_y = (self[name] for name in plane)
             found = offset_note(self.time, numpy.stack([x, y], axis=1), numpy.stack([true_x, true_y], axis=1))
@@ -245,11 +233,7 @@ class Columns:
         return float(numpy.median(height[there])) if there.any() else 0.0
 
     def whole(self, *names: str) -> numpy.ndarray:
-        """Return columns that have no empty cell, ``(rows, columns)``.
-
-        Raises:
-            ValueError: if there is one.
-        """
+        """Return some columns as an array, ``(rows, columns)``; ValueError for an empty cell."""
         for name in names:
             missing = self.table[name].isna()
             if missing.any():
@@ -259,11 +243,7 @@ class Columns:
         return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
 
     def sigmas(self, *names: str) -> numpy.ndarray:
-        """Return columns of standard deviations, all above zero and without an empty cell, ``(rows, columns)``.
-
-        Raises:
-            ValueError: if one is not above zero.
-        """
+        """Return columns of standard deviations, ``(rows, columns)``; ValueError unless all are above zero."""
         found = self.whole(*names)
         for name in names:
             check_deviations(self, name, self[name])
@@ -277,14 +257,7 @@ class Columns:
         return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 
     def regular(self, why: str) -> float:
-        """Return the sampling interval, s, after a check that the times are regular.
-
-        Args:
-            why: reason, for the error message.
-
-        Raises:
-            ValueError: if the times are not regular.
-        """
+        """Return the sampling interval, s; raise ValueError, with the reason ``why``, if it varies."""
         interval = self.interval()
         steps = numpy.diff(self.time)
         off = numpy.abs(steps - interval) > UNEVEN * interval
@@ -298,7 +271,7 @@ class Columns:
 
 
 class TruthFile(NamedTuple):
-    """A file of the truth, see :mod:`.truth_files`."""
+    """Path and options of a file of the truth, see :mod:`.truth_files`."""
 
     path: Path
     offset: float = 0.0
@@ -318,7 +291,7 @@ def read_columns(
     """Return the :class:`.Recording` made of a table of measurements.
 
     Args:
-        path: path of a file.
+        path: that of the table.
         cls: the environment.
         keywords: parameters of the environment.
         truth: separate file of the truth.
@@ -413,11 +386,6 @@ def _add_truth(
     components: Sequence[Component],
     truth: TruthFile,
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Return a log's table with the truth of a separate file added, and notes.
-
-    Raises:
-        ValueError: if it cannot be read or matched, or the log has a truth already.
-    """
     here = [name for name in table if name.startswith(TRUTH)]
     if here:
         raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
@@ -433,17 +401,6 @@ def _add_truth(
 def _rename(
     read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
 ) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
-    """Return the table with renamed columns, and the old and new names of all columns of the file.
-
-    Args:
-        read: the columns.
-        names: names of all columns of the file.
-        renamed: pairs of old and new name; one column may be in several.
-        known: names that the environment reads.
-
-    Raises:
-        ValueError: for a missing column, a new name that is not read, or a name that occurs twice.
-    """
     for old, new in renamed:
         if old not in names:
             fate = "be left out" if new == LEFT_OUT else f"become {new}"
@@ -465,7 +422,6 @@ def _rename(
 
 
 def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
-    """Return a hint with the option ``--rename`` for columns with other names."""
     wanted, pairs = [*first, *columns], []
     for name in names:
         free = [each for each in wanted if each not in names]
@@ -481,12 +437,6 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
-    """Return the table with aliases of latitude, longitude and altitude renamed, and the names of all columns.
-
-    Args:
-        read: the columns.
-        names: names of all columns of the file.
-    """
     renamed: dict[str, str] = {}
     for true in ("", TRUTH):
         for name in GEODETIC:
@@ -497,7 +447,6 @@ def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas
 
 
 def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
-    """Return the times as written in a table: numbers, or text of dates."""
     try:
         return numbers("time", values).to_numpy()
     except ValueError:
@@ -532,7 +481,6 @@ def _side_by_side(
     reading_notes: Iterable[str],
     original: Mapping[str, str],
 ) -> Recording:
-    """Return one recording that contains all recordings of a file."""
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)
@@ -579,15 +527,11 @@ def _side_by_side(
                 origin={} if own.origin is None else own.origin._asdict(),
             )
         )
-    return side_by_side(recordings, notes=tuple(limit_notes(notes)))
+    return stack_recordings(recordings, notes=tuple(limit_notes(notes)))
 
 
 def _true_columns(task: Task, columns: Columns) -> list[str]:
-    """Return the names of the columns with the truth of every component; empty where it has none.
-
-    Raises:
-        ValueError: if a table has only a part of a position, for example, or true values of no component.
-    """
+    """Return the names of the columns with the truth of every component; empty where it has none."""
     names = [TRUTH + component.name.lower() for component in task.components]
     found = [name if columns.has(name) else "" for name in names]
     if columns.true and not any(found):
@@ -604,12 +548,11 @@ def _true_columns(task: Task, columns: Columns) -> list[str]:
 
 
 def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
-    """Return the values ``(T, ...)`` of the measurements' rows; NaN or empty text for a measurement without a row."""
+    """Return the values ``(T, ...)`` in the measurements' rows; NaN or empty text for a measurement without one."""
     shaped = (rows >= 0).reshape(-1, *[1] * (values.ndim - 1))
     return numpy.where(shaped, values[rows], "" if values.dtype.kind == "U" else numpy.nan)
 
 
 def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
-    """Return the truth of every component, ``(T, C)``; NaN where it is unknown."""
     unknown = numpy.full(len(columns.time), numpy.nan)
     return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

@@ -29,7 +29,7 @@ OWN = ("seconds", "length", "truth", "started")
 
 
 def is_recording(path: Any) -> bool:
-    """Return whether a path is a NetCDF file of a recording: it names the environment of its measurements."""
+    """Return whether a path is a NetCDF file that names the environment of its measurements."""
     try:
         return names_environment(Path(path))
     except Exception:  # the reader of this kind of file reports the error
@@ -37,18 +37,14 @@ def is_recording(path: Any) -> bool:
 
 
 def names_environment(path: Path) -> bool:
-    """Return whether a file is NetCDF and names the environment of its measurements.
-
-    Raises:
-        Exception: any, for a file with the suffix of NetCDF and other contents.
-    """
+    """Return whether a file is NetCDF and names an environment; any exception for an invalid file."""
     if path.suffix != ".nc":
         return False
     return "environment" in netcdf_attribute_names(path)
 
 
 def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
-    """Return the fields of a :class:`Recording` from a dataset; ``initial`` may be missing.
+    """Return the fields of a :class:`Recording` by name from a dataset; ``initial`` may be missing.
 
     Raises:
         ValueError: if the dataset is no recording.
@@ -112,7 +108,7 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
     """Return the recording in a NetCDF file, after checks of environment and parameters.
 
     Args:
-        path: path of the file.
+        path: that of the file.
         cls_of: function from an environment id to its task.
         environment: required id; None: the one in the file.
         keywords: parameters that override those of the file.
@@ -145,7 +141,6 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Set the initial estimate in ``fields``, computed from the first measurements of the tracks."""
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
         raise ValueError(

@@ -1,9 +1,9 @@
 """Inertial navigation from rates and accelerations: alignment, aiding by fixes, and free running.
 
-The strapdown algorithm and the error-state Kalman filter are those of pyins (``pip install 'filtergym[ins]'``). Tables
-are of pandas, by time in s: inertial measurements with the columns ``gyro_x`` to ``gyro_z`` (rad/s) and ``accel_x`` to
-``accel_z`` (specific force, m/s^2) forward, right and down in the vehicle; fixes with ``lat``, ``lon`` (degrees),
-``alt`` (m) and ``VN``, ``VE``, ``VD`` (m/s north, east, down).
+Strapdown algorithm and error-state Kalman filter are those of pyins (``filtergym[ins]``). Tables are of pandas, by
+time in s: inertial measurements with the columns ``gyro_x`` to ``gyro_z`` (rad/s) and ``accel_x`` to ``accel_z``
+(specific force, m/s^2) forward, right and down in the vehicle; fixes with ``lat``, ``lon`` (degrees), ``alt`` (m) and
+``VN``, ``VE``, ``VD`` (m/s north, east, down).
 
 1. **Alignment.** While the vehicle stands, the mean specific force gives roll and pitch, and the mean rates less the
    rotation of the Earth are the bias of the gyroscopes. The heading is the course of the first motion less the angle
@@ -49,7 +49,7 @@ DEVIATION_STEP = 0.1
 
 @dataclass(frozen=True)
 class InertialErrors:
-    """Assumed errors of an IMU; the defaults are those of a consumer IMU in a car with its engine running."""
+    """Assumed errors of an IMU; the defaults are those of a consumer IMU in a car with a running engine."""
 
     gyroscope_noise: float = 0.05
     """Root density of white noise, degrees/s^0.5."""
@@ -67,7 +67,7 @@ class InertialErrors:
 
 @dataclass(frozen=True)
 class Alignment:
-    """State of the INS at the end of the standstill."""
+    """Result of the alignment: state of the INS at the end of the standstill."""
 
     start: Any
     """Position, velocity and attitude, a series of pyins named by its time."""
@@ -77,7 +77,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class AidedInertial:
-    """The INS aided by fixes, at every sample of the IMU."""
+    """Estimates of an INS aided by fixes, at every sample of the IMU."""
 
     trajectory: Any
     """Latitude, longitude (degrees), altitude, velocity and attitude; a table of pyins by time."""
@@ -98,7 +98,7 @@ def check_pyins() -> None:
 
 
 def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0) -> Alignment:
-    """Return the INS aligned at the standstill at the beginning of a log.
+    """Return the state of an INS at the end of the standstill at the beginning of a log (:class:`Alignment`).
 
     Args:
         inertial: measurements of the IMU.
@@ -152,11 +152,9 @@ def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0)
 
 
 def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
-    """Raise ValueError unless means at rest are those of an IMU whose axes are forward, right and down.
+    """Raise ValueError unless mean rates and forces at rest fit axes forward, right and down.
 
-    Args:
-        rates: mean rates, rad/s, ``(3,)``.
-        force: mean specific force, m/s^2, ``(3,)``.
+    ``rates`` are in rad/s, ``force`` in m/s^2, ``(3,)`` each.
     """
     size = float(numpy.linalg.norm(force))
     if abs(size - GRAVITY) > GRAVITY_TOLERANCE * GRAVITY:
@@ -182,7 +180,7 @@ def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
 
 
 def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: float) -> None:
-    """Raise ValueError unless turns and speed changes of the IMU agree with those of the fixes.
+    """Raise ValueError unless turns and speed changes by the IMU agree with those by the fixes.
 
     Turns of the course and changes of speed from fix to fix are regressed on the integrals of the down rate and of the
     forward acceleration; both slopes should be one.
@@ -237,7 +235,7 @@ def aid(
     lever: Sequence[float] = (0.0, 0.0, 0.0),
     errors: InertialErrors | None = None,
 ) -> AidedInertial:
-    """Return the INS aided by position and velocity fixes from the end of the standstill on.
+    """Aid an INS by position and velocity fixes from the end of the standstill on; return its estimates.
 
     Args:
         alignment: result of :func:`align`.
@@ -284,7 +282,6 @@ def aid(
 
 @contextmanager
 def _no_deprecations() -> Iterator[None]:
-    """Context manager: suppress the warning about a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The copy keyword is deprecated")
         yield
@@ -293,9 +290,9 @@ def _no_deprecations() -> Iterator[None]:
 def free_inertial(
     navigation: AidedInertial, times: numpy.ndarray, lever: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Any:
-    """Return latitude, longitude (degrees) and altitude (m) of the antenna at times, s, as columns of a table.
+    """Run the INS without fixes from the first of some times, s, on; return the antenna's positions as a table.
 
-    The INS runs without fixes from the first of the times.
+    Its columns are latitude, longitude (degrees) and altitude (m).
     """
     import pandas
     from pyins import strapdown, transform, util
@@ -321,7 +318,7 @@ def free_windows(
     site: tuple[float, float],
     lever: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> numpy.ndarray:
-    """Return the positions of the free-running INS in windows of K times, ``(E, K, 2)``, m east and north of a site.
+    """Run the INS without fixes in windows of K times; return positions ``(E, K, 2)``, m east and north of a site.
 
     Args:
         navigation: the aided INS.
@@ -339,6 +336,6 @@ def free_windows(
 
 
 def tangent_plane(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
-    """Return the coordinates ``(2, n)``, m east and north of a site (rad), of a table of geodetic positions."""
+    """Return a table's geodetic positions as coordinates ``(2, n)``, m east and north of a site (rad)."""
     latitude, longitude = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
     return east_north(latitude, longitude, positions["alt"].to_numpy(), site)

@@ -39,7 +39,7 @@ OFFSET_TOLERANCE = 0.3
 
 
 class TruthTable(NamedTuple):
-    """True values by time."""
+    """True values of a separate file, with their times, kind of clock, and notes."""
 
     clock: str
     """Kind of the times: dates, times of day, or seconds."""
@@ -59,7 +59,7 @@ def read_truth(
     times: Sequence[str],
     sort: bool = False,
 ) -> TruthTable:
-    """Return the true positions in a file, a table or a receiver log, by time.
+    """Return the true positions in a file, a table or a receiver's log, by time.
 
     Args:
         path: path of the file, with a time and x and y (m), latitude and longitude (degrees), or components.
@@ -108,11 +108,11 @@ def _wanted(log_format: LogFormat) -> str:
 def match_truth(
     truth: TruthTable, times: "pandas.Series", offset: float, periods: Mapping[str, float]
 ) -> tuple[dict[str, numpy.ndarray], str]:
-    """Return the truth at the times of a log, NaN where unknown, and a note on the number of rows with a truth.
+    """Interpolate the truth at the times of a log, NaN where unknown; return also a note on the matched rows.
 
     Args:
         truth: result of :func:`read_truth`.
-        times: times of the log, as written.
+        times: those of the log, as written.
         offset: offset added to the times of the truth, s.
         periods: periods of the columns that are angles, which are interpolated the shorter way round.
 
@@ -157,7 +157,7 @@ def match_truth(
 
 
 def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarray) -> str:
-    """Return a note on a constant clock offset that would bring positions nearer to the truth; empty if none does.
+    """Return a note on a constant clock offset that would bring positions nearer to the truth; else empty.
 
     Args:
         time: times of the log, s, ``(n,)``.
@@ -169,7 +169,6 @@ def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarr
         return ""
 
     def distances(rows: slice) -> numpy.ndarray:
-        """Return the median distance at each offset, m; infinite where few times are common."""
         found = []
         for offset in OFFSETS:
             at = [

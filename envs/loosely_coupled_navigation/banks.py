@@ -59,7 +59,7 @@ class Innovations(NamedTuple):
 
 
 class GainState(NamedTuple):
-    """State of the plain scheme, whose gain is the action."""
+    """State of a filter whose gain is the action: position, variance, innovation statistics."""
 
     position: Array
     """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
@@ -76,7 +76,7 @@ class GainState(NamedTuple):
 
 
 class Augmented(NamedTuple):
-    """State of the augmented filter, whose noises the action scales."""
+    """State of a filter of position and rate errors, whose noises the action scales."""
 
     position: Array
     """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
@@ -112,7 +112,7 @@ class Schemes(NamedTuple):
 
 
 class KalmanBucyBank(Bank[Task, Measurement, Any]):
-    """Base class of the banks: innovation statistics, and the observation blocks that all banks share."""
+    """Base class of the Kalman-Bucy filters' banks: innovation statistics and common observation blocks."""
 
     parameters: LooselyCoupledNavigationParameters
     filters: tuple[str, ...] = ()
@@ -127,7 +127,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovations, their averages, the receiver's report, the last action, and the time."""
+        """Observation blocks: innovations, their averages, the receiver's report, the last action, the time."""
         xp, p = self.xp, self.parameters
         nominal = math.sqrt(p.receiver_variance)
         names = [name.replace("-", "_") for name in self.filters]
@@ -186,7 +186,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Reported deviation and innovations in m, computed from the observation."""
+        """Reported variance, m^2, and innovations, m, computed from the observation."""
         nominal = self.parameters.receiver_variance
         return (
             Quantity(
@@ -204,21 +204,21 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         )
 
     def last_action(self) -> Block:
-        """Return the observation block of the previous action."""
+        """Return the observation block of the previous action; subclasses define it."""
         raise NotImplementedError
 
     def no_innovations(self, zero: Array) -> Innovations:
-        """Return the innovation statistics at the start of the track: zeros, in the shape of ``zero``."""
+        """Return innovation statistics of zero at the start of the track, in the shape of ``zero``."""
         return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
 
     def log_density(self, innovations: Innovations) -> Array:
-        """Return the Gaussian log-density of the last innovations, for each axis."""
+        """Return the Gaussian log-density of the last innovation on each axis."""
         return -0.5 * innovations.normalised * innovations.normalised - self.xp.log(
             math.sqrt(2.0 * math.pi) * innovations.deviation
         )
 
     def consistency(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """Return the records NIS, degrees of freedom and log-likelihood of one filter; NaN without a measurement."""
+        """Return the records NIS, degrees of freedom and log-likelihood of one filter; NaN without a fix."""
         xp, there = self.xp, measurement.available > 0.0
         nis = ordered_sum(state.innovations.normalised * state.innovations.normalised)
         return {
@@ -230,11 +230,11 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
     def update_innovations(
         self, before: Innovations, measurement: Measurement, position: Array, variance: Array
     ) -> Innovations:
-        """Return the innovation statistics of predicted positions; without a measurement the averages do not change.
+        """Return the innovation statistics of a measurement; without a fix the averages do not change.
 
         Args:
-            before: at the measurement before.
-            measurement: that arrives.
+            before: those at the previous measurement.
+            measurement: INS and receiver.
             position: predicted, m, of the shape of the innovations.
             variance: of its error, m^2, broadcast against it.
         """
@@ -259,18 +259,18 @@ NOISES = ("receiver", "coloured", "white")
 
 
 class NoiseBank(KalmanBucyBank):
-    """Bank of the control ``noise``: the augmented filter, whose noises the action scales."""
+    """Bank of the control ``noise``: a filter with estimated rate errors, whose noises the action scales."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
     @property
     def reach(self) -> float:
-        """Share of the logarithm of the largest factor that an action of one applies."""
+        """Share of the range of the noise factors, in logarithms, that actions within [-1, 1] use."""
         return self.parameters.noise_reach
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every filter, and the predicted standard deviation of the position."""
+        """Observation blocks of every bank here, and the predicted standard deviation of the position."""
         nominal = math.sqrt(self.parameters.receiver_variance)
         return (
             *super().blocks,
@@ -287,7 +287,7 @@ class NoiseBank(KalmanBucyBank):
         return last_action_block(NOISES)
 
     def start(self, initial: Initial) -> Augmented:
-        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
+        """Return the filter's state at the start of the track, with the modelled prior of the rate errors."""
         zero = 0.0 * initial.mean
         covariance = self.parameters.prior_covariance(zero[0])
         return Augmented(
@@ -301,7 +301,7 @@ class NoiseBank(KalmanBucyBank):
         )
 
     def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
-        """Return the covariance predicted to the measurement with the noises that an action scales."""
+        """Return the covariance predicted to the measurement with noises that an action scales."""
         p, xp = self.parameters, self.xp
         coloured, white = xp.exp(self.reach * math.log(p.process_scale) * action[1:])
         growth, displacement = p.variance_growth
@@ -353,12 +353,12 @@ class NoiseBank(KalmanBucyBank):
         return self.eye * state.covariance.position
 
     def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: NIS and log-likelihood, NaN without a fix."""
+        """Return the NIS, its degrees of freedom and log-likelihood to record, by name; NaN without a fix."""
         return self.consistency(state, measurement)
 
 
 class GainBank(KalmanBucyBank):
-    """Bank of the control ``gain``: the plain scheme with one gain for each axis, which the action sets."""
+    """Bank of the control ``gain``: position corrected by one gain for each axis, which the action sets."""
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
@@ -378,7 +378,7 @@ class GainBank(KalmanBucyBank):
         return last_action_block(self.axes)
 
     def start(self, initial: Initial) -> GainState:
-        """Return the bank's state at the start of the track, where INS and reference agree."""
+        """Return the filter's state at the start of the track, where INS and reference agree."""
         zero = 0.0 * initial.mean
         variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
         return GainState(initial.mean, variance, self.no_innovations(zero), zero, zero)
@@ -401,7 +401,7 @@ class GainBank(KalmanBucyBank):
         return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + beyond))
 
     def action_for_gain(self, gain: Any) -> Any:
-        """Return the action, as a NumPy array, for which :meth:`gain` returns gains in [0, 1].
+        """Return the action for which :meth:`gain` returns gains in [0, 1], a NumPy array.
 
         Gains up to ``smallest_gain`` give -1, the action of gain zero.
         """
@@ -411,7 +411,7 @@ class GainBank(KalmanBucyBank):
         return numpy.where(gain <= smallest, -1.0, action)
 
     def act(self, state: GainState, measurement: Measurement, action: Array) -> GainState:
-        """Return the state updated with the gain that the action sets; without a measurement the gain is zero."""
+        """Return the state updated with the gain that the action sets; without a fix the gain is zero."""
         action = self.xp.clip(action, -1.0, 1.0)
         gain = measurement.available * self.gain(action)
         R = measurement.reported_deviation * measurement.reported_deviation
@@ -434,9 +434,7 @@ class GainBank(KalmanBucyBank):
         return self.eye * state.variance.modelled
 
     def records(self, state: GainState, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: NIS, log-likelihood (NaN without a fix), gain and
-        K.
-        """
+        """Return NIS, log-likelihood (NaN without a fix), gain and other values to record, by name."""
         found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
@@ -451,9 +449,7 @@ With less its variance is lost in rounding, and the filter reports certainty."""
 
 
 class SchemeBank(KalmanBucyBank):
-    """Bank of the controls ``mode`` and ``weights``: three parallel filters without mixing, whose estimates it
-    weights.
-    """
+    """Bank of the controls ``mode`` and ``weights``: weighted estimates of three unmixed parallel filters."""
 
     filters: tuple[str, ...] = SCHEMES
 
@@ -474,7 +470,7 @@ class SchemeBank(KalmanBucyBank):
         return last_weight_block(names, value=lambda f: f.weights, text="weight of the last measurement")
 
     def start(self, initial: Initial) -> Schemes:
-        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
+        """Return the three filters' state at the start of the track, with the prior of the rate errors."""
         xp, p = self.xp, self.parameters
         zero = 0.0 * initial.mean
         each = xp.stack([zero] * 3)
@@ -535,17 +531,16 @@ class SchemeBank(KalmanBucyBank):
         return weighted_sum(state.weights, self.xp.moveaxis(state.position, 0, 1))
 
     def covariance(self, state: Schemes) -> Array:
-        """Return the covariance of the weighted mean with the spread of the estimates, m^2, ``(A, A, N)``."""
+        """Return the covariance of the weighted mean with the spread of the filters, m^2, ``(A, A, N)``."""
         xp = self.xp
         variance = xp.concat([state.plain_variance[:, 0], state.covariance.position[None]])
         position = xp.moveaxis(state.position, 0, 1)
         return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
 
     def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: weights, NIS, and the mixture's log-likelihood.
+        """Return weights, NIS and mixture log-likelihood (both NaN without a fix) to record, by name.
 
-        They are NaN without a measurement. The NIS is the weighted mean of the filters', or that of the selected
-        filter.
+        The NIS is the weighted mean of the filters', or that of the selected filter.
         """
         there = measurement.available > 0.0
         of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.innovations), 1, 0))

@@ -34,8 +34,6 @@ def _is_unreported(moment: Moment) -> Array | None:
 
 
 def _within(window: str, phrase: str) -> Cause:
-    """Return the cause that a measurement lies in a window of the context."""
-
     def holds(moment: Moment) -> Array | None:
         return (
             is_within(moment.measurement.number, moment.context[window])
@@ -46,13 +44,13 @@ def _within(window: str, phrase: str) -> Cause:
     return Cause(window, phrase, holds)
 
 
-def number_at(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
+def measurement_number(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
     """Return the number of the measurement nearest to a time in s."""
     return namespace(time).round(time / parameters.sampling_interval)
 
 
 class Levels(NamedTuple):
-    """State of :class:`NoiseChanges`."""
+    """State of the receiver's noise: true and reported levels in each part of the episode, and now."""
 
     true: Array
     """Standard deviation of the receiver noise before, between and after its changes, m, ``(3, N)``."""
@@ -67,17 +65,17 @@ class Levels(NamedTuple):
 
 
 class NoiseChanges(Disturbance):
-    """Receiver noise that differs between episodes and changes up to twice in each, reported or not."""
+    """Disturbance by receiver noise that differs between episodes and changes up to twice, reported or not."""
 
     name = "noise_changes"
     causes = (Cause("unreported noise", "where the receiver is noisier than it reports", _is_unreported),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Levels:
-        """Return the drawn noise levels of the receiver, the times of their changes, and the reported levels."""
+        """Draw the receiver's noise levels, the times of their changes, and which changes are reported."""
         xp, p = self.xp, self.parameters
         factor = draws.log_uniform("receiver_factor", p.receiver_factor)
         changes = draws.integer("noise_changes", p.noise_changes)
-        first, second = number_at(draws.uniform("change_start", p.change_start, 2), p)
+        first, second = measurement_number(draws.uniform("change_start", p.change_start, 2), p)
         factors = [factor, *draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2)]
         unreported = draws.event("unreported", p.unreported, 2)
         both = changes == 2
@@ -91,11 +89,11 @@ class NoiseChanges(Disturbance):
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
     def switch_off(self, state: Levels, undisturbed: Array) -> Levels:
-        """Return the state with the true noise equal to the reported one where ``undisturbed``."""
+        """Return the state with the true noise as reported in the episodes where ``undisturbed``."""
         return state._replace(true=self.xp.where(undisturbed, state.reported, state.true))
 
     def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
-        """Return the state with the true and reported levels of this measurement."""
+        """Return the state with the true and reported noise levels at this measurement."""
         if not self.parameters.noise_changes[1]:
             return state
         level, report = (
@@ -105,7 +103,7 @@ class NoiseChanges(Disturbance):
         return state._replace(level=level, report=report)
 
     def change_deviations(self, state: Levels, deviations: Array) -> Array:
-        """Return the standard deviations times the receiver's true level at this measurement, m."""
+        """Return the standard deviations times the receiver's true noise level, m."""
         return state.level * deviations
 
     def change_measurement(
@@ -115,7 +113,7 @@ class NoiseChanges(Disturbance):
         return state, measurement._replace(reported_deviation=state.report)
 
     def context(self, state: Levels) -> dict[str, Array]:
-        """Return the context: noise levels, and the measurements of their changes (-1 where there is none), by name."""
+        """Return noise levels, and the measurements of their changes (-1: none), by name."""
         return {
             "receiver_levels": state.true,
             "reported_levels": state.reported,
@@ -123,7 +121,7 @@ class NoiseChanges(Disturbance):
         }
 
     def records(self, state: Levels) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: the reported standard deviation."""
+        """Return the reported standard deviation, to record at a measurement, by name."""
         return {"reported_deviation": state.report}
 
 
@@ -132,14 +130,14 @@ def _shown(window: Array) -> Array:
 
 
 class ReceiverColour(ColouredErrors):
-    """Errors of the receiver that are correlated in time, independent on each axis."""
+    """Disturbance by receiver errors that are correlated in time, independent on each axis."""
 
     def __init__(self, task: Task) -> None:
         p = task.parameters
         super().__init__(task, p.sampling_interval, p.axes, p.receiver_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Return the drawn standard deviation, m, and correlation time, s, of the receiver's coloured errors."""
+        """Draw the standard deviation, m, and correlation time, s, of the receiver's coloured errors."""
         p = self.parameters
         deviation = draw_between(draws.uniform, "receiver_coloured", p.receiver_coloured)
         lasting = draw_between(draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time)
@@ -150,12 +148,12 @@ class ReceiverColour(ColouredErrors):
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the context: decay of the errors between measurements, and their driving noise, m, by name."""
+        """Return the decay of the coloured errors between measurements and their driving noise, m, by name."""
         return {"receiver_decay": state.process.decay, "receiver_kick": state.process.kick}
 
 
 class Spell(NamedTuple):
-    """State of a receiver disturbance that occurs at most once in an episode."""
+    """State of a receiver disturbance that occurs at most once: its window, strength, the measurement's number."""
 
     window: Array
     """First measurement of the disturbance and the first one after it, ``(2, N)``."""
@@ -175,27 +173,22 @@ class _Once(Disturbance):
         )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Spell:
-        """Return the drawn window of the disturbance: its first measurement and the first one after it, if it
-        occurs.
-        """
         xp, p = self.xp, self.parameters
         happens = draws.event(self.name, self.probability)
-        first = number_at(draws.uniform(f"{self.name}_start", self.start), p)
-        beyond = first + number_at(draws.uniform(f"{self.name}_duration", self.duration), p)
+        first = measurement_number(draws.uniform(f"{self.name}_start", self.start), p)
+        beyond = first + measurement_number(draws.uniform(f"{self.name}_duration", self.duration), p)
         window = xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
         return Spell(window, zero, zero)
 
     def advance(self, state: Spell, step: DisturbanceInput) -> Spell:
-        """Return the disturbance's state with the number of this measurement, for comparison with its window."""
         return state._replace(number=step.number)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the context: the disturbance's window of measurements (-1 where it does not occur), by name."""
         return {self.name: _shown(state.window)}
 
 
 class Outage(_Once):
-    """Receiver outage: there is no fix."""
+    """Disturbance by a receiver outage, at most one in an episode: there is no fix."""
 
     name = "outage"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -216,71 +209,70 @@ class _Hidden(_Once):
     """Receiver disturbance that the measurement does not report."""
 
     def switch_off(self, state: Spell, undisturbed: Array) -> Spell:
-        """Return the state without the disturbance in the episodes where ``undisturbed``."""
         return state._replace(window=self.xp.where(undisturbed, NEVER, state.window))
 
 
 class Jamming(_Hidden):
-    """Jamming: the receiver's noise rises, unreported. Its strength is the factor on the standard deviation."""
+    """Disturbance by jamming, at most once in an episode: the receiver's noise rises, unreported."""
 
     name = "jamming"
     causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
 
-    def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Return the state with the drawn jamming factor on the receiver's standard deviation."""
+    def draw_further(self, state: Spell, draws: Draws) -> Spell:
+        """Return the state with the jamming's drawn factor on the standard deviation."""
         factor = draw_between(draws.log_uniform, "jamming_factor", self.parameters.jamming_factor)
         return state._replace(strength=self.xp.sqrt(state.strength + factor))
 
     def change_deviations(self, state: Spell, deviations: Array) -> Array:
-        """Return the standard deviations, multiplied by the jamming factor during the jamming."""
+        """Return the standard deviations, multiplied by the factor while there is jamming."""
         if not self.probability:
             return deviations
         jammed = is_within(state.number, state.window)
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the context: the window of the jamming, and its factor on the standard deviation, by name."""
+        """Return the window of the jamming and its factor on the standard deviation, by name."""
         return {**super().context(state), "jamming_gain": state.strength}
 
 
 class Spoofing(_Hidden):
-    """Spoofing: the fix drifts off on every axis; its strength is the rate of the drift, m/s."""
+    """Disturbance by spoofing, at most once in an episode: the fix drifts off on every axis."""
 
     name = "spoofing"
     causes: ClassVar[tuple[Cause, ...]] = (_within("spoofing", "under spoofing"),)
 
-    def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Return the state with the drawn rate of the spoofed drift, m/s."""
+    def draw_further(self, state: Spell, draws: Draws) -> Spell:
+        """Return the state with the spoofing's drawn drift rate, m/s."""
         rate = draw_between(draws.uniform, "spoofing_rate", self.parameters.spoofing_rate)
         return state._replace(strength=state.strength + rate)
 
-    def pull(self, state: Spell) -> Array:
-        """Return the spoofing error of the fix on every axis at this measurement, m, ``(N,)``."""
+    def fix_error(self, state: Spell) -> Array:
+        """Return the error of the spoofed fix on every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
         return self.xp.where(is_within(state.number, state.window), run, 0.0)
 
     def change_reading(self, state: Spell, reading: Array) -> tuple[Spell, Array]:
         """Return the state, and the fix with the spoofing error added."""
-        return state, reading + self.pull(state) if self.probability else reading
+        return state, reading + self.fix_error(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the context: the window of the spoofing and its rate, m/s, by name."""
+        """Return the window of the spoofing and its drift rate, m/s, by name."""
         return {**super().context(state), "spoofing_rate": state.strength}
 
 
 class ReceiverOutliers(Outliers):
-    """Outliers of the receiver: single fixes with larger noise, independent of each other."""
+    """Disturbance by outliers of the receiver: single fixes with larger noise, independent of each other."""
 
     name = "outliers"
     causes: ClassVar[tuple[Cause, ...]] = (OUTLIER,)
 
     @staticmethod
-    def limits(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
-        """Return the probability of an outlier and the factor on its standard deviation, from the parameters."""
+    def probability_and_factor(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
+        """Return the probability of an outlier and the factor on its standard deviation."""
         return parameters.outlier_probability, math.sqrt(parameters.outlier_factor)
 
     def change_deviations(self, state: Array, deviations: Array) -> Array:
-        """Return the standard deviations times the outlier factor of this measurement."""
+        """Return the standard deviations times this measurement's factor: one, or that of an outlier."""
         return state * deviations if self.probability else deviations
 
 

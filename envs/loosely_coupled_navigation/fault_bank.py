@@ -14,9 +14,9 @@ pull. So there are J + (J - 1) B filters.
 
 Reading: one pull and one chain of levels serve all axes, but the rate of the pull is estimated on each axis alone.
 
-The bank is the estimator ``fault-bank`` of the baselines and the filter that the control ``hypotheses`` steers. H
-hypotheses predict to the fix with weights p' and covariances P', and the levels of the receiver have probabilities q'.
-Factors f of its settings change the update with this fix alone:
+The control ``hypotheses`` steers this estimator, ``fault-bank``. H hypotheses predict to the fix with weights p' and
+covariances P', and the levels of the receiver have probabilities q'. Factors f of its settings change the update with
+this fix alone:
 
     p'(h) <- p'(h) f1^pulled(h) f2^modelled(h)                                              renormalised by Bayes' rule
     q'(l) <- q'(l) f3^s(l),    R <- R f4
@@ -52,7 +52,7 @@ SAME_REPORT = 1e-9
 
 
 class Hypotheses(NamedTuple):
-    """Hypotheses of J noises and M onsets, with S = 4 states (delta, beta, eta, e), or 5 with the rate of a pull."""
+    """Gaussian hypotheses of J noises and M spoofing onsets, with S = 4 states (delta, beta, eta, e) or 5."""
 
     mean: Array
     """Means, ``(S, A, J, M, N)``."""
@@ -63,7 +63,7 @@ class Hypotheses(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Hypotheses and levels that the bank keeps from one measurement to the next."""
+    """Hypotheses and receiver noise levels that the bank keeps between measurements."""
 
     free: Hypotheses
     """Hypotheses without a pull, M = 1."""
@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 
 class Weighing(NamedTuple):
-    """Predicted hypotheses weighted by a measurement: those without a pull first, H in all."""
+    """Predicted hypotheses weighted by a measurement: weights, level probabilities, innovations; H in all."""
 
     log_likelihood: Array
     """Log-likelihood of the measurement, ``(N,)``."""
@@ -99,7 +99,7 @@ class Weighing(NamedTuple):
 
 
 class FaultState(NamedTuple):
-    """State of the fault bank."""
+    """State of the fault bank: estimate, hypotheses and noise levels, likelihood."""
 
     mean: Array
     """Mean of the whole bank, m, ``(A, N)``."""
@@ -110,11 +110,9 @@ class FaultState(NamedTuple):
 
 
 class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
-    """Bank of Kalman filters over the noises of INS and receiver and over the onset of spoofing.
+    """Estimator ``fault-bank``: Kalman filters over noises of INS and receiver and over the onset of spoofing.
 
     Args:
-        task: the problem.
-        prior: of faults and noises.
         **changed: fields of the prior.
     """
 
@@ -149,7 +147,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         self.onsets: Array = task.constant(numpy.arange(float(prior.onsets)))[:, None] * self.spacing
 
     def start(self, initial: Initial) -> FaultState:
-        """Return the bank's state at the start of the track: INS and reference agree, no pull (spoofing)."""
+        """Return the bank's state at the start of the track: INS and reference agree, no spoofing."""
         xp, noises = self.xp, self.noises
         none = 0.0 * initial.mean[0]
         zero = none + 0.0 * noises.drift
@@ -166,7 +164,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
     def start_pulls(self, free: Hypotheses) -> Hypotheses:
-        """Return hypotheses whose pull begins now, ``(J - 1, 1)``, one for each noise but the modelled one."""
+        """Return the hypotheses that spoofing begins now, ``(J - 1, 1)``, for all noises but the modelled one."""
         xp = self.xp
         none = 0.0 * free.weights[1:]
         P = faults.FaultCovariance(
@@ -181,21 +179,19 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def since_onset(self, number: Array) -> Array:
-        """Return the number of measurements since the onset of each pull hypothesis, ``(B, N)``.
-
-        Args:
-            number: of the current measurement.
-        """
+        """Return the number of measurements since each hypothesis' onset of spoofing, ``(B, N)``."""
         cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
     def age(self, number: Array) -> Array:
-        """Return the age of each pull hypothesis, s, ``(B, N)``; onsets lie midway between hypotheses."""
+        """Return the duration so far of each hypothesis' spoofing, s, ``(B, N)``; onsets lie midway between two."""
         return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
-    def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
-        """Return the hypotheses after pulls have ended and new ones have begun at a measurement."""
+    def switch_spoofing(
+        self, free: Hypotheses, pulled: Hypotheses, number: Array
+    ) -> tuple[Hypotheses, Hypotheses]:
+        """Return the hypotheses with spoofing ended and begun at a measurement, by their hazards."""
         xp, prior, T = self.xp, self.prior, self.interval
         since, age = self.since_onset(number), self.age(number)
         born = (since == 0.0) & (number >= self.onsets)
@@ -227,7 +223,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return free, pulled
 
     def merge(self, begun: Hypotheses, pulled: Hypotheses, staying: Array, hazard: Array) -> Hypotheses:
-        """Return the hypotheses without a pull merged with the ended ones, by their moments; S = 4, ``(J - 1, 1)``."""
+        """Return the hypotheses without spoofing merged with those that ended, by their moments, ``(J - 1, 1)``."""
         xp = self.xp
         weights = xp.concat([begun.weights * staying, pulled.weights * hazard], axis=1)
         mean = xp.concat([begun.mean, pulled.mean], axis=3)[:4]
@@ -244,9 +240,9 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return Hypotheses(centre[:, :, :, None], faults.from_matrix(moments[:, :, :, None]), total[:, None])
 
     def predict(self, state: FaultState, measurement: Measurement) -> FaultState:
-        """Return the state predicted to a measurement, after pulls have begun and ended."""
+        """Return the state predicted to a measurement, after spoofing may have begun or ended."""
         memory = state.memory
-        free, pulled = self.change(memory.free, memory.pulled, measurement.number)
+        free, pulled = self.switch_spoofing(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
         changing = 1.0 - _exponential(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
@@ -258,22 +254,19 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return state._replace(memory=memory)
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where there is a fix, so that an action has an effect, zero elsewhere, ``(N,)``."""
+        """Return 1 where there is a fix, so that an action has an effect, else 0, ``(N,)``."""
         return measurement.available
 
     def examine(self, state: FaultState, measurement: Measurement) -> Weighing:
-        """Return the predicted hypotheses weighted by a fix, without factors."""
+        """Return the predicted hypotheses weighted by a fix, without the action's factors."""
         return self.weigh(state.memory, measurement)
 
     def apply_factors(
         self, predicted: Memory, measurement: Measurement, logarithms: Array
     ) -> tuple[Memory, Weighing]:
-        """Return the predicted hypotheses with scaled process noise, and their weighting by a fix with all factors.
+        """Return the predicted hypotheses with scaled process noise, and weighted by a fix with all factors.
 
-        Args:
-            predicted: by :meth:`predict`.
-            measurement: that arrives.
-            logarithms: of the factors of the settings, ``(6, N)``.
+        ``logarithms`` are those of the factors of the settings, ``(6, N)``.
         """
         xp = self.xp
         receiver, *noises = xp.exp(logarithms[3:])
@@ -289,13 +282,13 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
 
     def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
-        """Return the state with the predicted hypotheses weighted and updated by a fix, and the bank's moments."""
+        """Return the state with the predicted hypotheses weighted and updated by a fix, and their mean."""
         predicted, measurement = state.memory, inputs.measurement
         if inputs.action is None:
             weighing = self.weigh(predicted, measurement)
         else:
             predicted, weighing = self.apply_factors(predicted, measurement, inputs.action)
-        return self.take(predicted, measurement, weighing)
+        return self.posterior_state(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:
         """Return the likelihood of a fix under its prediction; NaN where there is none."""
@@ -307,7 +300,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def predict_part(self, h: Hypotheses, noises: Noises) -> Hypotheses:
-        """Return some hypotheses predicted by one step, with these noises."""
+        """Return hypotheses predicted by one step, with these noises."""
         xp, s = self.xp, self.parameters.sampling
         one, zero = 0.0 * noises.decay + 1.0, 0.0 * noises.decay
         pulls = h.mean.shape[0] - 4
@@ -326,11 +319,11 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         variance_factors: Array = 1.0,
         level_factors: Array = 1.0,
     ) -> Weighing:
-        """Return the posterior weights of predicted hypotheses and levels given a measurement.
+        """Return the predicted hypotheses and noise levels with their posterior weights given a measurement.
 
         Args:
-            predicted: by :meth:`predict`.
-            measurement: that arrives.
+            predicted: result of :meth:`predict`.
+            measurement: with or without a fix.
             evidence: added to the logarithms of the hypotheses' weights, nats, ``(H, N)`` or a number.
             variance_factors: multiply the variance of every level, ``(N,)`` or a number.
             level_factors: multiply the probabilities of the levels, ``(L, N)`` or a number.
@@ -351,8 +344,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             self.weigh_part(pulled, xp.stack([xp.ones_like(age), age]), fix, there, levels, q),
         ]
         expected, innovations, directions, noises = zip(*parts, strict=True)
-        before = self.join([free.weights, pulled.weights], 0)
-        log_weights = self.join(
+        before = self.join_groups([free.weights, pulled.weights], 0)
+        log_weights = self.join_groups(
             [
                 imm.log_probabilities(part.weights) + xp.where(there, noise.log_density, 0.0)
                 for part, noise in zip((free, pulled), noises, strict=True)
@@ -362,16 +355,16 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         log_weights = log_weights + evidence
         log_likelihood = imm.log_sum(log_weights)
         weights = xp.exp(log_weights - log_likelihood)
-        posterior = weighted_sum(weights, self.join([noise.responsibilities for noise in noises], 1))
+        posterior = weighted_sum(weights, self.join_groups([noise.responsibilities for noise in noises], 1))
         if prior.outlier:
             posterior = posterior[:-1] + posterior[-1] * chain
-        innovation = weighted_sum(before, self.join(innovations, 1))
-        own = weighted_sum(before, self.join([along.variance for along in directions], 0))
+        innovation = weighted_sum(before, self.join_groups(innovations, 1))
+        own = weighted_sum(before, self.join_groups([along.variance for along in directions], 0))
         return Weighing(
             log_likelihood,
             weights,
             xp.where(there, posterior, chain),
-            weighted_sum(before, self.join(expected, 1)),
+            weighted_sum(before, self.join_groups(expected, 1)),
             own,
             ordered_sum(innovation * innovation) / (own + white),
             innovations,
@@ -382,7 +375,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     def weigh_part(
         self, h: Hypotheses, shares: Array, fix: Array, there: Array, levels: Array, q: Array
     ) -> tuple[Array, Array, faults.Direction, faults.NoiseMixture]:
-        """Return predicted difference, innovations, update directions and noise of some hypotheses at a fix.
+        """Return predicted difference, innovations, update directions and noise of hypotheses at a fix.
 
         Args:
             h: hypotheses.
@@ -406,7 +399,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return expected, innovation, along, noise
 
-    def take(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
+    def posterior_state(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
         """Return the state after the update of predicted hypotheses with their posterior weights."""
         xp = self.xp
         there = measurement.available > 0.0
@@ -424,9 +417,11 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
                 strict=True,
             )
         )
-        weights, delta = weighing.weights, self.join([free.mean[0], pulled.mean[0]], 1)
+        weights, delta = weighing.weights, self.join_groups([free.mean[0], pulled.mean[0]], 1)
         mean = weighted_sum(weights, delta)
-        own = weighted_sum(weights, self.join([each.covariance.ins.position for each in (free, pulled)], 0))
+        own = weighted_sum(
+            weights, self.join_groups([each.covariance.ins.position for each in (free, pulled)], 0)
+        )
         offsets = delta - mean[:, None]
         spread = weighted_sum(weights, offsets[:, None] * offsets[None])
         memory = Memory(free, pulled, weighing.levels, predicted.reported)
@@ -441,7 +436,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         noise: faults.NoiseMixture,
         there: Array,
     ) -> Hypotheses:
-        """Return some predicted hypotheses updated with their innovations; their weights do not change."""
+        """Return predicted hypotheses updated with their innovations; their weights do not change."""
         xp = self.xp
         squares = ordered_sum(innovation * innovation)
         push = xp.where(there, noise.score, 0.0) * innovation
@@ -450,8 +445,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         mean = xp.concat([xp.stack(moved), h.mean[3:] + along.faults[:, None] * push])
         return Hypotheses(mean, faults.update_fault(h.covariance, along, weight), h.weights)
 
-    def join(self, values: Sequence[Array], before: int) -> Array:
-        """Return an array ``(..., H, N)`` of values of both groups of hypotheses, with ``before`` leading axes."""
+    def join_groups(self, values: Sequence[Array], before: int) -> Array:
+        """Return values of both groups of hypotheses as one array ``(..., H, N)``, with ``before`` leading axes."""
         return self.xp.concat(
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
             axis=before,
@@ -463,22 +458,17 @@ def _exponential(power: Any) -> Any:
 
 
 def _flat(h: Hypotheses) -> list[Array]:
-    """Return the arrays of some hypotheses' covariance as a flat list."""
     return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
 
 
 def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
-    """Return the covariance of a list of arrays: the inverse of :func:`_flat`."""
     return faults.FaultCovariance(AugmentedCovariance(*arrays[:6]), arrays[6], arrays[7])
 
 
 def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.FaultCovariance, ...]:
-    """Return the process noise covariances of one step: Q of the INS and W of the receiver's coloured error.
+    """Return the process noise covariances of one step: Q of the INS, W of the receiver's coloured error.
 
-    Args:
-        noises: of the hypotheses.
-        s: sampling of the INS error.
-        pulls: errors of the receiver beside the coloured one.
+    ``pulls`` is the number of receiver errors beside the coloured one.
     """
     none = 0.0 * noises.decay
     ins = AugmentedCovariance(none, none, none, none, none, none)
@@ -494,7 +484,7 @@ def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.Fau
 
 
 def add_noise(h: Hypotheses, steps: Sequence[faults.FaultCovariance], factors: Sequence[Array]) -> Hypotheses:
-    """Return the predicted hypotheses with each process noise covariance of a step multiplied by a factor, ``(N,)``."""
+    """Return predicted hypotheses with each process noise of a step multiplied by a factor, ``(N,)``."""
     inertial, wandering = steps
     more, further = (factor - 1.0 for factor in factors)
     ins = (P + more * Q for P, Q in zip(h.covariance.ins, inertial.ins, strict=True))

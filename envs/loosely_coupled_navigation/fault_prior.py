@@ -13,7 +13,7 @@ LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))
 
 
 class FaultPrior(NamedTuple):
-    """Prior of the fault bank; times in s."""
+    """Prior of the fault bank: spoofing, noise levels and noises; times in s."""
 
     points: int = 6
     """Number of noise points beside the modelled one."""
@@ -91,7 +91,7 @@ def spread_points(points: int, dimensions: int) -> numpy.ndarray:
 
 
 class Noises(NamedTuple):
-    """Noises of J hypotheses, as NumPy arrays ``(J,)``, in the bank ``(J, 1, 1)`` each."""
+    """Noises of J hypotheses, arrays ``(J,)``, in the bank ``(J, 1, 1)``."""
 
     drift: Array
     """Standard deviation of the constant rate error, m/s."""
@@ -108,7 +108,7 @@ class Noises(NamedTuple):
 
 
 def draw_noises(prior: FaultPrior, p: LooselyCoupledNavigationParameters) -> Noises:
-    """Return the noise points of the hypotheses, the modelled one first, ``(J,)`` each."""
+    """Return the noises of J hypotheses, spread evenly over the prior after the modelled ones, ``(J,)`` each."""
     interval = p.sampling_interval
     unit = spread_points(prior.points, 5).T
 

@@ -48,7 +48,7 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank, KalmanBucyBank):
-    """Bank of the control ``hypotheses``: the fault bank with factors on its weights, levels and noises."""
+    """Bank of the control ``hypotheses``: estimator ``fault-bank`` with factors on weights, levels and noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
 
@@ -63,7 +63,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every filter, the likelihood of the fix, and probabilities of the hypotheses."""
+        """Observation blocks of every bank here, and others, such as probabilities of the hypotheses."""
         xp = self.xp
         nominal = 0.5 * self.parameters.axes * math.log(2.0 * math.pi * self.parameters.receiver_variance)
         return (
@@ -102,7 +102,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         """Return the bank's state at the start of the track, from the initial estimate."""
         own, zero = self.own.start(initial), 0.0 * initial.mean
         memory, none = own.memory, zero[0]
-        weights = self.own.join([memory.free.weights, memory.pulled.weights], 0)
+        weights = self.own.join_groups([memory.free.weights, memory.pulled.weights], 0)
         groups = self.group(weights, self.own.age(none))
         return HypothesesState(
             own=own,
@@ -117,11 +117,9 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         )
 
     def group(self, weights: Array, age: Array) -> Array:
-        """Return the probabilities of groups of hypotheses, ``(G, N)``, from those of all hypotheses, ``(H, N)``.
+        """Sum the probabilities of all hypotheses, ``(H, N)``, to those of observed groups, ``(G, N)``.
 
-        Args:
-            weights: probabilities of the hypotheses, ``(H, N)``.
-            age: of the pulls, s, ``(B, N)``.
+        ``age`` is that of the spoofing, s, ``(B, N)``.
         """
         xp, points, onsets = self.xp, self.own.prior.points, self.own.prior.onsets
         free = weights[: 1 + points]
@@ -134,10 +132,10 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
     def add_observed(
         self, state: HypothesesState, result: Weighing, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the innovations, and the probabilities before and after the fix, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the fix, filled in."""
         bank, predicted, p = self.own, state.own.memory, result.weights
         age = bank.age(measurement.number)
-        weights = bank.join([predicted.free.weights, predicted.pulled.weights], 0)
+        weights = bank.join_groups([predicted.free.weights, predicted.pulled.weights], 0)
         expected = measurement.ins - result.expected
         return state._replace(
             likelihood=bank.likelihood(result, measurement),

@@ -1,9 +1,8 @@
 """Recordings of LooselyCoupledNavigation made from a log of a raw IMU and a log of position fixes.
 
 The INS is aligned at a standstill and aided by the fixes. It then runs free in successive windows (see
-``envs/logs/strapdown.py``), each from the velocity, attitude and biases that the aided INS has at its start. A window
-is an episode; its measurements are the positions of the INS, east and north, beside the fixes with the deviations that
-the receiver reports.
+``envs/logs/strapdown.py``), each from the velocity, attitude and biases of the aided INS. A window is an episode; its
+measurements are positions of the INS, and the fixes with their reported deviations.
 
 The environment takes the position at the start for the true one. So the INS begins at the true position if it is known,
 and otherwise at that of the aided INS, whose error stays in the window.
@@ -75,7 +74,7 @@ def inertial_recording(
     source: str = "",
     licence: str = "",
 ) -> Recording:
-    """Return a recording of LooselyCoupledNavigation made from a log of an IMU and a log of fixes.
+    """Make a recording of LooselyCoupledNavigation from a log of an IMU and a log of position fixes.
 
     Files are CSV, NetCDF, Parquet or JSON, tables those of pandas. Both have ``time``, seconds or dates of one clock.
 
@@ -132,7 +131,7 @@ def inertial_recording(
     seconds = T * numpy.broadcast_to(numpy.arange(1.0, K + 2.0), (len(starts), K + 1))
     return Recording(
         environment=TASK.id,
-        measurements=measurements_beside(
+        measurements=paired_measurements(
             ins, tangent_plane(positions, origin).T, deviations, rows[at[:, 1:]]
         ),
         initial={"mean": ins[:, 0], "covariance": numpy.zeros((len(starts), 2, 2))},
@@ -149,15 +148,15 @@ def inertial_recording(
     )
 
 
-def measurements_beside(
+def paired_measurements(
     ins: numpy.ndarray, fixes: numpy.ndarray, deviations: numpy.ndarray, rows: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a ``Measurement`` from INS positions and the fixes at the same times, by name.
+    """Return the arrays of a ``Measurement`` by name, from INS positions and the fixes at the same times.
 
     Args:
         ins: positions of the INS from the start on, m, ``(E, 1 + K, 2)``.
         fixes: positions of all fixes, m, ``(n, 2)``.
-        deviations: of them, m, ``(n,)``.
+        deviations: those of the fixes, m, ``(n,)``.
         rows: the fix at each measurement, ``(E, K)``; -1: none.
     """
     there = rows >= 0
@@ -177,11 +176,11 @@ def measurements_beside(
 def read_columns(
     data: Any, what: str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> tuple["pandas.DataFrame", str]:
-    """Return columns of a file or table as numbers, indexed by time, s, and the kind of clock of its times.
+    """Return columns in a file or table as numbers, indexed by time, s, and the kind of clock of its times.
 
     Args:
         data: a file or a table.
-        what: its name in sentences.
+        what: its name in messages.
         needed: columns beside ``time``.
         optional: further ones.
 
@@ -218,7 +217,7 @@ def read_columns(
 def read_inertial(
     data: Any, rate_unit: str, acceleration_unit: str, mounting: Sequence[float], delay: float
 ) -> tuple["pandas.DataFrame", str]:
-    """Return the table of body rates and specific forces forward, right and down, and the clock of its times.
+    """Return an IMU's rates and specific forces forward, right and down as a table, and the clock of its times.
 
     Raises:
         ValueError: for unknown units, empty cells, or measurements too far apart.
@@ -253,7 +252,7 @@ def read_inertial(
 
 
 def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple["pandas.DataFrame", str]:
-    """Return the table of latitude, longitude (degrees), altitude (m) and further columns, and its clock.
+    """Return latitude, longitude (degrees), altitude (m) and further columns as a table, and its clock.
 
     Raises:
         ValueError: if positions are not whole, of neither kind, or metres without a site.
@@ -292,11 +291,9 @@ def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple[
 
 
 def geodetic_of_local(coordinates: numpy.ndarray, site: Sequence[float]) -> numpy.ndarray:
-    """Return the latitude, longitude (degrees) and height (m), ``(3, n)``, of points east, north and up of a site.
+    """Return latitude, longitude (degrees) and height (m), ``(3, n)``, of points east, north and up of a site.
 
-    Args:
-        coordinates: ``(3, n)``, m.
-        site: latitude, longitude, degrees, and height, m.
+    ``site`` is its latitude and longitude, degrees, and height, m.
     """
     latitude, longitude, height = numpy.radians(site[0]), numpy.radians(site[1]), site[2]
     away = east_north_up(latitude, longitude).T @ coordinates
@@ -321,11 +318,7 @@ def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: st
 
 
 def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
-    """Return the standard deviations of fixes, m, ``(n,)``, from their column, else ``sigma``.
-
-    Raises:
-        ValueError: if neither is a positive number.
-    """
+    """Return the standard deviations of fixes, m, ``(n,)``, from their column, else ``sigma``."""
     stated = fixes["sigma"].to_numpy() if "sigma" in fixes else numpy.full(len(fixes), numpy.nan)
     deviations = numpy.where(numpy.isfinite(stated), stated, numpy.nan if sigma is None else sigma)
     if not (deviations > 0.0).all():
@@ -353,7 +346,7 @@ def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
 
 
 def difference_half(deviations: numpy.ndarray) -> float:
-    """Return half of the time between positions whose difference is a velocity of ``DIFFERENCED_SIGMA``, s."""
+    """Return half of the time, s, between two fixes whose difference gives a velocity of ``DIFFERENCED_SIGMA``."""
     return float(numpy.median(deviations)) / DIFFERENCED_SIGMA / 2.0**0.5
 
 
@@ -365,7 +358,7 @@ def aided_inertial(
     lever: Sequence[float],
     errors: InertialErrors | None,
 ) -> AidedInertial:
-    """Return the INS solution aligned at the standstill and aided by fixes.
+    """Return the INS aligned at the standstill and aided by fixes, after a check against them.
 
     Raises:
         ValueError: if it cannot be aligned, or does not follow the fixes.
@@ -416,7 +409,7 @@ def regular_times(time: numpy.ndarray, end: float) -> tuple[numpy.ndarray, numpy
 
 
 def interpolate(values: numpy.ndarray, time: numpy.ndarray, times: numpy.ndarray) -> numpy.ndarray:
-    """Return the values ``(n, A)`` interpolated at other times; NaN in long gaps and beyond the ends."""
+    """Return values ``(n, A)`` interpolated at other times; NaN in long gaps and beyond the ends."""
     found = numpy.stack(
         [numpy.interp(times, time, column, numpy.nan, numpy.nan) for column in values.T], axis=1
     )

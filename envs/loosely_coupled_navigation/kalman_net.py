@@ -33,7 +33,7 @@ GAINS = ("caution", "drift_gain", "coloured_gain")
 
 
 class KalmanNetBank(NoiseBank):
-    """Bank of the learned estimator ``kalman-net``: the augmented filter, whose noises and gain the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises and gain of an augmented filter."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(
         -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
@@ -68,12 +68,12 @@ class KalmanNetBank(NoiseBank):
         return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
 
     def start(self, initial: Initial) -> Augmented:
-        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
+        """Return the filter's state at the start of the track, with the modelled prior of the rate errors."""
         state = super().start(initial)
         return state._replace(action=self.xp.concat([state.action, state.action]))
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Return the state predicted with the noises of the last action's first part, as under control ``noise``."""
+        """Return the state predicted with the noises that the last action set."""
         predicted = super().predict(state._replace(action=state.action[: len(NOISES)]), measurement)
         return predicted._replace(action=state.action)
 

@@ -11,7 +11,7 @@ from .world import Measurement
 
 
 class PositionInput(LiveInput):
-    """Converter of an INS position at every measurement, and of a fix where there is one, into measurements."""
+    """Converter of live INS positions, and of receiver fixes where there are any, into measurements."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return the names and descriptions of the values of a measurement, and of those at the start."""
@@ -25,7 +25,7 @@ class PositionInput(LiveInput):
         return initial, {**memory, "ins": ins}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the measurement with INS increment and fix, and the memory; an incomplete fix is ignored."""
+        """Return the measurement of INS increment and fix, and the memory; an incomplete fix is ignored."""
         p = self.parameters
         values = {
             **values,

@@ -38,16 +38,16 @@ def measure(
     sigma: numpy.ndarray,
     p: Any,
 ) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a ``Measurement`` from n rows of a table or from n tracks, by name.
+    """Return the arrays of a ``Measurement`` by name, from INS positions and fixes of n rows or tracks.
 
     A fix without all axes counts as missing.
 
     Args:
-        number: of the measurement, ``(n,)``.
+        number: number of the measurement, ``(n,)``.
         ins: position by the INS, m, ``(axes, n)``.
-        before: the same at the measurement before.
+        before: the same at the previous measurement.
         fix: position by the receiver, m, ``(axes, n)``; NaN where there is none.
-        sigma: deviation that it reports, m, ``(n,)``; NaN where it reports none.
+        sigma: reported deviation, m, ``(n,)``; NaN where there is none.
         p: parameters.
     """
     there = numpy.isfinite(fix).all(axis=0)
@@ -64,18 +64,14 @@ def measure(
 def start_track(
     measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
 ) -> TrackStart:
-    """Return the start of every episode, at the INS position before the first increment."""
+    """Return the start of every episode of a log: at the INS position before the first increment."""
     mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
     covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
     return TrackStart(measurements, {"mean": mean, "covariance": covariance}, 0)
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Return the measurements of one track from the columns of a table.
-
-    Raises:
-        ValueError: for missing or impossible values.
-    """
+    """Return the INS and receiver measurements of one track from the columns of a table."""
     ends = [f"_{axis}" for axis in AXES if columns.has(f"ins_{axis}") or columns.has(f"fix_{axis}")]
     if columns.has("ins") or not ends:
         ends = [""]
@@ -110,7 +106,7 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def predict_fix(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Return the position that an estimate and the INS increment predict, and the fix, m, ``(axes, N)`` each."""
+    """Return the position predicted by an estimate and the INS increment, and the fix, m, ``(axes, N)`` each."""
     return mean + measurement.increment, numpy.where(measurement.available > 0.0, measurement.fix, numpy.nan)
 
 

@@ -17,7 +17,7 @@ A covariance after the update contains both. With 1e16 none was indefinite, with
 
 @dataclass(frozen=True)
 class LooselyCoupledNavigationParameters(TaskParameters):
-    """Constants of the episode; "ours" because the paper states no numbers, with the reason after it."""
+    """Constants of LooselyCoupledNavigation; "ours", with the reason, because the paper states no numbers."""
 
     axes: int = parameter(1, at_least=1, at_most=len(AXES))
     """Coordinates, 1 (paper) to 3, independent of each other."""
@@ -175,14 +175,12 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @property
     def receiver_variance(self) -> float:
-        """Nominal variance of a measurement, ``N / sampling_interval``, m^2."""
+        """Nominal variance of the receiver's fix, ``N / sampling_interval``, m^2."""
         return self.receiver_intensity / self.sampling_interval
 
     @property
     def equivalent_intensities(self) -> tuple[float, float]:
-        """Equivalent white intensity Ge of the two tunings, m^2/s: white part alone, and with the coloured part reduced
-        to white.
-        """
+        """White noise intensities Ge of the two tunings, m^2/s: without the coloured error, and with it made white."""
         return (
             self.white_intensity,
             self.white_intensity + 2.0 * self.coloured**2 * self.correlation_time,
@@ -190,13 +188,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @property
     def plain_growth(self) -> tuple[float, float]:
-        """Variance that the position error gains between measurements, for each of the two tunings, m^2."""
+        """Variance that the position error gains between measurements, m^2, under each of the two tunings."""
         white, reduced = self.equivalent_intensities
         return white * self.sampling_interval, reduced * self.sampling_interval
 
     @property
     def steady_state_gains(self) -> tuple[float, float]:
-        """Steady-state gains of the plain scheme for each of the two tunings."""
+        """Steady-state gains of the filter without rate errors, for each of the two tunings."""
         white, reduced = (ins_gnss.steady_state_gain(q, self.receiver_variance) for q in self.plain_growth)
         return white, reduced
 
@@ -207,15 +205,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @functools.cached_property
     def variance_growth(self) -> tuple[float, float]:
-        """Variances that the modelled coloured rate error (m^2/s^2) and the displacement (m^2) gain between
-        measurements.
-        """
+        """Variances that the coloured rate error (m^2/s^2) and the displacement (m^2) gain between measurements."""
         return (
             (self.coloured * self.sampling.coloured) ** 2,
             self.white_intensity * self.sampling_interval + self.coloured**2 * self.sampling.residual,
         )
 
     def prior_covariance(self, none: Array) -> ins_gnss.AugmentedCovariance:
-        """Return the initial covariance of position and rate errors from zeros ``none``, ``(N,)``."""
+        """Return the initial covariance of position and rate errors; ``none`` is zeros ``(N,)``."""
         drift, coloured = none + self.drift**2, none + self.coloured**2
         return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)

@@ -2,8 +2,8 @@
 
 Every episode has a random motion, except in ``paper``, which has the sine of the paper.
 
-The times of disturbances are drawn for each episode, so that a policy cannot memorise them: the window "during"
-contains the measurements that certainly lie in the disturbance, "after" those certainly past it.
+The times of disturbances are drawn for each episode: the window "during" contains the measurements that certainly lie
+in the disturbance, "after" those certainly past it.
 """
 
 from collections.abc import Mapping

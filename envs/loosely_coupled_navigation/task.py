@@ -163,7 +163,7 @@ class LooselyCoupledNavigation(Task):
     parameters: LooselyCoupledNavigationParameters
 
     def set_up(self) -> None:
-        """Name the components of the axes, and compute the action of the paper's steady-state gain."""
+        """Name the components, one for each axis, and set the paper's policy to its steady-state gain."""
         p = self.parameters
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         group = "position" if p.axes > 1 else ""

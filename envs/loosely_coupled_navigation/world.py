@@ -17,7 +17,7 @@ from .parameters import LooselyCoupledNavigationParameters
 
 
 class Truth(NamedTuple):
-    """The true motion, the errors of the INS, and the disturbances of the receiver; A axes."""
+    """True motion, INS errors, and state of the receiver's disturbances; A axes."""
 
     number: Array
     """Number of measurements so far, ``(N,)``."""
@@ -67,7 +67,7 @@ class Measurement(NamedTuple):
 
 
 class InsGnssWorld(World[Task, Truth, Measurement]):
-    """World of harmonic motion, an inertial system with three rate errors, and a satellite receiver."""
+    """World of harmonic motion, an inertial system (INS) with three rate errors, and a satellite receiver."""
 
     own_parameters: ClassVar[tuple[str, ...]] = ("duration",)
     parameters: LooselyCoupledNavigationParameters
@@ -89,9 +89,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Return the drawn truth (noise levels, disturbances, rate errors) and the initial estimate, equal in
-        position.
-        """
+        """Draw noise levels, disturbances and rate errors; return this truth, and its position as initial estimate."""
         xp, p = self.xp, self.parameters
         calm = draw_undisturbed(draws, p)
 
@@ -107,7 +105,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         states = self.disturbances.begin(draws, normals[2 * p.axes :], zeros[0])
         harmonics, turn = self._motion(draws, zeros)
         reference = ordered_sum(harmonics[0])
-        states = self.disturbances.switch_off(self.disturbances.complete(states, draws), calm)
+        states = self.disturbances.switch_off(self.disturbances.draw_further(states, draws), calm)
         truth = Truth(
             number=zeros[0],
             reference=reference,
@@ -128,9 +126,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, Initial(reference, self.no_covariance + zeros[0])
 
     def _motion(self, draws: Draws, zeros: Array) -> tuple[Array, Array]:
-        """Return the initial harmonics of the motion, m, and the sines and cosines of their step, ``(2, M, A, N)``
-        each.
-        """
+        """Draw the harmonics of the motion: initial values, m, and rotation in a step, ``(2, M, A, N)`` each."""
         xp, p = self.xp, self.parameters
         count, many = max(p.manoeuvres, 1), zeros[None] + xp.zeros((max(p.manoeuvres, 1), 1, 1))
         if p.manoeuvres:
@@ -200,13 +196,11 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def error_cost(self, error: Array) -> Array:
-        """Return the squared position error, summed over the axes, over the nominal variance of a fix, ``(N,)``."""
+        """Return the squared position error, summed over axes, over the nominal variance of a fix, ``(N,)``."""
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: whether there is a fix, its true and reported
-        noise.
-        """
+        """Return whether there is a fix, and its true and reported noise, to record at a measurement, by name."""
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,
@@ -214,7 +208,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context by name: noise levels, disturbances and the receiver's current state.
+        """Return noise levels, disturbances and the receiver's current state, among other draws, by name.
 
         Times are numbers of measurements: the first in a window and the first one after it.
         """

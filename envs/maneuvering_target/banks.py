@@ -110,7 +110,7 @@ class Filters(NamedTuple):
 
 
 class RadarBank(Bank[TargetProblem, Measurement, Any]):
-    """Base class of the banks: averages, intervals, and the observation blocks of the measurement."""
+    """Base class of the banks on radar scans: averages, intervals, observation blocks of the measurement."""
 
     parameters: ManeuveringTargetParameters
 
@@ -122,7 +122,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         self.average: str = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
     def exponential_average(self, measurement: Measurement, old: Array, new: Array) -> Array:
-        """Return the exponential average updated with a new value, where the scan saw the target."""
+        """Return an exponential average, updated with a new value where the scan saw the target."""
         return self.where_detected(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
     def interval(self, measurement: Measurement) -> float | Array:
@@ -130,7 +130,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.T if self.regular else measurement.interval
 
     def time_since_last(self, measurement: Measurement) -> float | Array:
-        """Return the time since the last scan that saw the target, s, its magnitude at least :data:`SHORTEST`.
+        """Return the time since the last scan that saw the target, s; at least :data:`SHORTEST` in magnitude.
 
         It is negative for a delayed measurement.
         """
@@ -140,7 +140,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.xp.where(self.xp.abs(measurement.elapsed) < least, least, measurement.elapsed)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """Return ``then`` where the scan saw the target and ``otherwise`` elsewhere: arrays, or tuples of them."""
+        """Return ``then`` where the scan saw the target, else ``otherwise``: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
@@ -191,7 +191,7 @@ class GainBank(RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovations, their averages, the gain, and the time."""
+        """Observation blocks: innovations, their averages, the prediction's share, the gain, detection and times."""
         xp = self.xp
         return (
             innovation_block("xy", value=lambda f, _: f.innovation / xp.sqrt(f.innovation_variance)),
@@ -213,7 +213,7 @@ class GainBank(RadarBank):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Innovation in m, computed from the observation."""
+        """Innovation and its predicted standard deviation, m, computed from the observation."""
         sigma = self.parameters.range_sigma
         return (
             Quantity(
@@ -231,7 +231,7 @@ class GainBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> AlphaBeta:
-        """Return the bank's state at the start of the track, equation (24)."""
+        """Return the filter's state at the start of the track, equation (24)."""
         xp, P = self.xp, initial.covariance
         variance, velocity_variance = xp.stack([P[0, 0], P[1, 1]]), xp.stack([P[2, 2], P[3, 3]])
         zero = 0.0 * variance
@@ -285,7 +285,7 @@ class GainBank(RadarBank):
         return (alpha - 0.5 * (low + high)) / (0.5 * (high - low))
 
     def act(self, state: AlphaBeta, measurement: Measurement, action: Array) -> AlphaBeta:
-        """Return the state updated with the position gain of the action and the velocity gain beta that follows."""
+        """Return the state updated with the position gain of the action and the velocity gain that follows."""
         xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.time_since_last(measurement)
         beta = alpha_beta.benedict_bordner_beta(alpha)
         updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, elapsed)
@@ -298,11 +298,10 @@ class GainBank(RadarBank):
         return self.where_detected(measurement, after, missed)
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Return the covariance by the gains used plus the effect of an unmodelled acceleration, ``(4, 4, N)``.
+        """Return the covariance under the gains used, plus that of an unmodelled acceleration, ``(4, 4, N)``.
 
-        The acceleration is the usual one, or the one that the last innovations indicate, since the measurement
-        before the
-        last.
+        The acceleration is the usual one, or the one that the last innovations indicate, since the measurement before
+        the last.
         """
         xp, f = self.xp, state
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
@@ -323,7 +322,7 @@ class GainBank(RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), gain."""
+        """Return NIS, log-likelihood (NaN without a measurement) and gain to record at a scan, by name."""
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
@@ -335,7 +334,7 @@ class GainBank(RadarBank):
 
 
 class FilterBank(RadarBank):
-    """Bank of the controls ``mode``, ``weights`` and ``evidence``: fixed-gain filters that are mixed by weights."""
+    """Bank of the controls ``mode``, ``weights`` and ``evidence``: an IMM of fixed-gain filters."""
 
     least_interval = LEAST_INTERVAL
 
@@ -354,7 +353,7 @@ class FilterBank(RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: those of each filter, likelihoods, probabilities, and the time."""
+        """Observation blocks: innovations of each filter, likelihoods, probabilities, detection and times."""
         xp = self.xp
         each = tuple(str(j + 1) for j in range(self.count))
 
@@ -386,7 +385,7 @@ class FilterBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> Filters:
-        """Return the bank's state at the start of the track, equation (24)."""
+        """Return the filters' state at the start of the track, equation (24)."""
         xp, m = self.xp, self.count
         zeros = xp.stack([0.0 * initial.mean[:2]] * m, axis=1)
         probabilities = self.task.constant(self.parameters.initial_probabilities)[:, None] + zeros[0]
@@ -405,7 +404,7 @@ class FilterBank(RadarBank):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Return the filters mixed, predicted to the scan, with the likelihood of the measurement in each."""
+        """Return the filters mixed and predicted to the scan, with the likelihood of the measurement in each."""
         xp, bank, interval = self.xp, state, self.interval(measurement)
         prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
         mean, covariance = imm.mix(bank.mean, bank.covariance, prediction.mixing)
@@ -448,7 +447,6 @@ class FilterBank(RadarBank):
         return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
     def _update_filters(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
-        """Return the filters updated with position gains alpha and velocity gains beta."""
         elapsed = self.time_since_last(measurement)
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(
@@ -457,9 +455,7 @@ class FilterBank(RadarBank):
         return state._replace(mean=self.xp.concat(updated), covariance=covariance)
 
     def _in_force(self, state: Filters, measurement: Measurement, after: Filters) -> Filters:
-        """Return the updated filters, or the predicted ones with probabilities (13) where the scan missed the
-        target.
-        """
+        """Return the updated filters; where the scan missed the target, the predicted ones with probabilities (13)."""
         if self.regular:
             return after
         predicted = imm.softmax(state.log_predicted)
@@ -474,7 +470,7 @@ class FilterBank(RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), weights."""
+        """Return NIS, log-likelihood (NaN without a measurement) and weights to record at a scan, by name."""
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
@@ -487,7 +483,7 @@ class FilterBank(RadarBank):
 
 
 class GainsBank(FilterBank):
-    """Bank of the control ``gains``: the paper's IMM, with position gains that the action sets."""
+    """Bank of the control ``gains``: the paper's IMM, whose position gains the action moves."""
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
@@ -500,7 +496,7 @@ class GainsBank(FilterBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every bank, and the gains."""
+        """Observation blocks of the other banks, and the gains."""
         each = tuple(str(j + 1) for j in range(self.count))
         return (
             *super().blocks,
@@ -508,9 +504,7 @@ class GainsBank(FilterBank):
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Return the filters updated with gains ``logit alpha = logit gain + gain_logits a``, weighted by Bayes'
-        rule.
-        """
+        """Return the filters updated with ``logit alpha = logit gain + gain_logits a``, weighted by Bayes' rule."""
         xp = self.xp
         moved = self.logit + self.parameters.gain_logits * xp.clip(action, -1.0, 1.0)
         alpha = 1.0 / (1.0 + xp.exp(-moved))

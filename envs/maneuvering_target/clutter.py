@@ -2,11 +2,10 @@
 
 False plots are a Poisson field over the whole plane, new in every scan. A tracker processes a window around the
 predicted position, so the plots of a scan are those in the window of the filter in the loop: uniformly distributed,
-independent of the target, and of unknown origin. That closes a loop: the radar needs the filter's estimate for the
-plots around it. The same random numbers make false plots at the same places of every filter's window.
+independent of the target, and of unknown origin. That closes a loop: the radar needs the filter's estimate. The same
+random numbers make false plots at the same places of every filter's window.
 
-Filters that use one plot receive the nearest to their prediction, as a common front end does it. The rule is the same
-for all: their estimate and covariance, predicted at constant velocity.
+Filters that use one plot receive the nearest to their estimate, predicted at constant velocity.
 """
 
 import math
@@ -20,7 +19,7 @@ from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 
 class ReportedTrack(NamedTuple):
-    """Estimate around which the radar returns plots: the feedback of a filter in clutter."""
+    """Feedback of a filter in clutter: the estimate around which the radar returns plots."""
 
     mean: Array
     """Position and velocity after the previous scan, ``(4, N)``."""
@@ -29,7 +28,7 @@ class ReportedTrack(NamedTuple):
 
 
 class Echo(NamedTuple):
-    """Plot that originates from the target, unknown to competitors."""
+    """Plot that originates from the target; competitors do not receive it as such."""
 
     position: Array
     """Position, m, ``(2, N)``."""
@@ -38,7 +37,7 @@ class Echo(NamedTuple):
 
 
 class ClutterState(NamedTuple):
-    """State of the clutter."""
+    """State of the clutter: density of false plots, the target's own plot, whether a false one was taken for it."""
 
     density: Array
     """False plots per square metre, ``(N,)``."""
@@ -50,7 +49,7 @@ class ClutterState(NamedTuple):
 
 
 class Clutter(Disturbance):
-    """False plots, uniformly distributed in a window around the track.
+    """Disturbance by clutter: false plots, uniformly distributed in a window around the track.
 
     The uniform numbers of a scan draw the number of plots, which of them is the target's, and the position of each.
     """
@@ -64,14 +63,14 @@ class Clutter(Disturbance):
         return parameters.cluttered
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
-        """Return the state with the drawn density of false plots, per square metre."""
+        """Draw the density of false plots, per square metre, for the disturbance's state."""
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
         return ClutterState(
             density, 0.0 * density, Echo(self.xp.stack([zero, zero]), 0.0 * density), 0.0 * density
         )
 
     def count(self, uniform: Array, density: Array) -> Array:
-        """Return the Poisson-distributed number of false plots in the window, ``(N,)``, below the number of slots.
+        """Draw the Poisson-distributed number of false plots in the window, ``(N,)``, below the number of slots.
 
         It is computed by the inverse of the cumulative distribution.
         """
@@ -87,7 +86,7 @@ class Clutter(Disturbance):
     def change_measurement(
         self, state: ClutterState, measurement: Any, step: DisturbanceInput
     ) -> tuple[ClutterState, Any]:
-        """Return the state, and the measurement with false plots added and one of all plots taken for the target."""
+        """Return the state, and the measurement with false plots and with the plot taken for the target's."""
         xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
             step.feedback,
@@ -129,7 +128,7 @@ class Clutter(Disturbance):
         )
 
     def predict(self, track: ReportedTrack, interval: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Return the predicted position at the scan, ``(2, N)``, and its covariance, ``(2, 2, N)``, for the gate.
+        """Return the track's position predicted to the scan, ``(2, N)``, and its covariance, ``(2, 2, N)``.
 
         The prediction is at constant velocity with an acceleration of ``gate_acceleration`` since the last plot.
         """
@@ -141,9 +140,9 @@ class Clutter(Disturbance):
         return centre, carried + left * identity
 
     def context(self, state: ClutterState) -> dict[str, Array]:
-        """Return the context: the density of false plots per square kilometre, by name."""
+        """Return the density of false plots per square kilometre, by name."""
         return {"clutter_density": 1e6 * state.density}
 
     def records(self, state: ClutterState) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: whether the plot taken for the target is false."""
+        """Return whether the plot taken for the target's is false, to record at a scan, by name."""
         return {"false_association": state.false_association}

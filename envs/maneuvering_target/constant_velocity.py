@@ -14,7 +14,7 @@ from .world import Measurement
 
 
 class ConstantVelocityModel:
-    """The constant-velocity model in x and y."""
+    """Constant-velocity model in x and y over any interval, and its update with a measured position."""
 
     def __init__(self, task: TargetProblem) -> None:
         self.task = task
@@ -28,26 +28,18 @@ class ConstantVelocityModel:
         self.identity: Array = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 
     def motion(self, T: Array) -> tuple[Array, Array]:
-        """Return the transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over
-        intervals.
-
-        Args:
-            T: s, ``(N,)``.
-
-        Returns:
-            :func:`.kalman.white_acceleration` of each, ``(4, 4, N)``.
-        """
+        """Return F and the process noise of an acceleration of 1 m/s^2 over intervals ``T`` (s), ``(4, 4, N)``."""
         by_acceleration = self.xp.stack([0.5 * T**2, 0.5 * T**2, T, T])
         return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """Return one of two tuples of arrays where the scan saw the target, the other where it missed it."""
+        """Return ``then`` where the scan saw the target, else ``otherwise``; both are tuples of arrays."""
         there = measurement.available > 0.0
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """Return the likelihood of a scan; NaN where it missed the target."""
+        """Return the :class:`Likelihood` of a scan; NaN where it missed the target."""
         there = measurement.available > 0.0
         log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
         return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
@@ -70,14 +62,14 @@ class ConstantVelocityModel:
 
 
 class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
-    """Base of the estimators with the constant-velocity model."""
+    """Base class of the estimators with the constant-velocity model."""
 
     def start(self, initial: Initial) -> Any:
         """Return the filter's state at the start of a track, from the initial estimate."""
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
-        """Return the initial estimate as the state of a single Kalman filter, with unknown likelihood."""
+        """Return the initial estimate as the state of one Kalman filter, with unknown likelihood."""
         return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
@@ -85,9 +77,9 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
         return state.mean[:4]
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of position and velocity, ``(4, 4, N)``, without further components of the state."""
+        """Return the covariance of position and velocity, ``(4, 4, N)``, without further components."""
         return state.covariance[:4, :4]
 
     def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """Return the result of an update as the filter's state, with the measurement's likelihood."""
+        """Return the result of a Kalman update as a filter's state, with the measurement's likelihood."""
         return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))

@@ -1,8 +1,6 @@
 """Courses (flight paths) of the target of ManeuveringTarget: one class for each kind of flight.
 
-A course draws its flight, moves the target from scan to scan, interpolates between two, and describes itself in
-the context. ``scan`` is the number of a scan, ``(N,)``; a motion is a position (m) and a velocity (m/s), ``(2, N)``
-each.
+``scan`` is the number of a scan, ``(N,)``; a motion is a position (m) and a velocity (m/s), ``(2, N)`` each.
 """
 
 import itertools
@@ -24,11 +22,7 @@ CIRCLE = (0.0, 2.0 * math.pi)
 
 
 class Course(ABC):
-    """Base class of the target's courses (flight paths).
-
-    Args:
-        task: with the parameters of the flight.
-    """
+    """Base class of the target's courses (kinds of flight paths)."""
 
     parameters: ManeuveringTargetParameters
 
@@ -39,12 +33,7 @@ class Course(ABC):
 
     @abstractmethod
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Return the drawn constants of each episode's flight, and the motion at the start.
-
-        Args:
-            draws: random quantities of each episode.
-            ones: ``(N,)``.
-        """
+        """Draw each episode's flight; return its constants, and the motion (position, velocity) at the start."""
 
     @abstractmethod
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
@@ -53,55 +42,41 @@ class Course(ABC):
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the motion at a scan that comes early by a share of the scan period.
+        """Return the motion at a scan that comes early; by default that of :meth:`advance` then.
 
         By default that of :meth:`advance`, for a course defined at any time.
 
         Args:
-            flight: of :meth:`begin`.
+            flight: constants of :meth:`begin`.
             scan: its number.
             early: the share, ``(N,)``.
-            before: motion when the scan before would have come on time.
-            on_time: motion when this one would have.
+            before: motion at the time of the previous scan without delay.
+            on_time: motion at the time of this scan without delay.
         """
         return self.advance(flight, scan - early, before)
 
-    def carry(self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Return deviations of position and velocity at a scan, propagated from a velocity deviation at the previous
-        one.
+    def propagate_deviation(
+        self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array
+    ) -> Motion:
+        """Return the deviations of position and velocity at a scan caused by a velocity deviation at the previous scan.
 
         A coordinated turn rotates the deviation, thrust does not. By default, without known turn rates, it is not
-        rotated.
-
-        Args:
-            flight: of :meth:`begin`.
-            scan: number of the scan.
-            early: shares of the scan period by which the previous scan and this one come early, ``(N,)`` each; None
-                where none
-                does.
-            velocity: the deviation at the previous scan, m/s, ``(2, N)``.
-
-        Returns:
-            Deviations of position and velocity.
+        rotated. ``early`` are shares of the scan period by which the previous scan and this one come early, ``(N,)``
+        each, or None; ``velocity`` is the deviation at the previous scan, m/s, ``(2, N)``.
         """
         before, now = early or (0.0, 0.0)
         return (self.parameters.sampling_interval * (1.0 + (before - now))) * velocity, velocity
 
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context of the flight by name: times and sizes of manoeuvres, and the current one.
+        """Return times and sizes of manoeuvres, and the current one, for the context, by name; by default none.
 
-        Args:
-            flight: of :meth:`begin`.
-            scan: number of the current scan.
-            time: of the current scan, in scan periods since the start.
+        ``time`` is that of the current scan, in scan periods since the start.
         """
         return {}
 
 
-def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
-    """Return the motion after a time (s) of a coordinated turn at constant speed; ``turn`` in rad/s, zero is
-    straight.
-    """
+def motion_in_turn(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
+    """Return the motion after a time (s) of a coordinated turn at constant speed; ``turn`` in rad/s, zero: straight."""
     state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
 
@@ -110,7 +85,7 @@ def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
 
 
 class Maneuvers(NamedTuple):
-    """Manoeuvres of a flight: the change of the motion in each scan from the first to the last."""
+    """Constants of a flight: the change of the motion in each scan period of its manoeuvres."""
 
     first: Array
     """Scan number, ``(manoeuvres, N)``."""
@@ -125,7 +100,7 @@ class Maneuvers(NamedTuple):
 
     @property
     def acceleration(self) -> Array:
-        """Acceleration of each manoeuvre's thrust along x and y, m/s^2, ``(2, manoeuvres, N)``."""
+        """Acceleration of the thrust in each manoeuvre along x and y, m/s^2, ``(2, manoeuvres, N)``."""
         return self.effect[4:]
 
 
@@ -136,7 +111,7 @@ class Maneuvered(Course):
     """Whether manoeuvres may be coordinated turns; otherwise all are thrust."""
 
     def advance(self, flight: Maneuvers, scan: Array, motion: Motion) -> Motion:
-        """Return the motion at a scan: straight flight plus the effect of the manoeuvre in this scan period."""
+        """Return the motion at a scan: straight flight, plus the manoeuvre in this scan period if any."""
         T, (position, before) = self.parameters.sampling_interval, motion
         effect = self._pick(flight, flight.effect, scan)
         acceleration = effect[4:]
@@ -158,42 +133,37 @@ class Maneuvered(Course):
             self._pick(flight, flight.turn, scan) / T,
             self._pick(flight, flight.acceleration, scan),
         )
-        position, velocity = after(time, turn, before, self.task)
+        position, velocity = motion_in_turn(time, turn, before, self.task)
         return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
 
-    def carry(
+    def propagate_deviation(
         self, flight: Maneuvers, scan: Array, early: tuple[Array, Array] | None, velocity: Array
     ) -> Motion:
-        """Return deviations at a scan: a velocity deviation, rotated at the turn rates of the scan periods in
-        between.
-        """
+        """Return the deviations at a scan that a velocity deviation causes, rotated at the turn rates until then."""
         if not self.turns:
-            return super().carry(flight, scan, early, velocity)
+            return super().propagate_deviation(flight, scan, early, velocity)
         nowhere = 0.0 * velocity
         if early is None:
             still = flight._replace(effect=self._without_thrust(flight.effect))
             return self.advance(still, scan, (nowhere, velocity))
         T, (before, now) = self.parameters.sampling_interval, early
         rates = [self._pick(flight, flight.turn, number) / T for number in (scan - 1.0, scan)]
-        motion = after(T * before, rates[0], (nowhere, velocity), self.task)
-        return after(T * (1.0 - now), rates[1], motion, self.task)
+        motion = motion_in_turn(T * before, rates[0], (nowhere, velocity), self.task)
+        return motion_in_turn(T * (1.0 - now), rates[1], motion, self.task)
 
     def _without_thrust(self, effect: Array) -> Array:
         return self.xp.concat([effect[:4], 0.0 * effect[4:]])
 
     def _pick(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
-        """Return the entries of values ``(..., manoeuvres, N)`` for the manoeuvre of the scan period that ends with a
-        scan.
-        """
         active = self.xp.astype((scan >= flight.first) & (scan <= flight.last), values.dtype)
         # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
         values = active * values
         return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
 
     def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context by name: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre.
+        """Return first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre, by name.
 
-        It also contains whether one is flown at present.
+        The context also states whether one is flown now.
         """
         xp = self.xp
         # A manoeuvre that is not flown lies beyond the end.
@@ -210,12 +180,12 @@ class Maneuvered(Course):
 
 
 class StatedManeuver(Maneuvered):
-    """The paper's flight: one period of thrust at stated scans."""
+    """The paper's flight: straight, with one period of thrust at stated scans."""
 
     turns = False
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Return the constant manoeuvre of the flight and the motion at its start, without a random number."""
+        """Return the constant manoeuvre of the flight, and the motion at its start, without a random number."""
         p, constant, once = self.parameters, self.task.constant, ones[None]
         first, last = p.maneuver_steps
         effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
@@ -225,7 +195,6 @@ class StatedManeuver(Maneuvered):
 
 
 def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
-    """Return the drawn position and velocity at the start of a random flight."""
     xp = draws.xp
     start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
     speed, course = draws.uniform("speed", p.speed), draws.uniform("course", CIRCLE)
@@ -239,7 +208,7 @@ class RandomManeuvers(Maneuvered):
     turns = True
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Return the drawn manoeuvres of each flight, and the motion at its start."""
+        """Draw the manoeuvres of each flight, and the motion at its start."""
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         slots = p.maneuver_count[1]
         position, velocity = _draw_start(draws, p)
@@ -287,7 +256,7 @@ class RandomStraight(Course):
     """Random straight flights: start, speed and direction, no manoeuvre."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[None, Motion]:
-        """Return None, since the flight has no constants, and the drawn motion at its start."""
+        """Draw the motion at the start; return None as constants of the flight, and the motion."""
         motion = _draw_start(draws, self.parameters)
         draws.unit("maneuver_count")
         return None, motion
@@ -309,9 +278,9 @@ class RandomStraight(Course):
 
 
 class Legs(NamedTuple):
-    """A flight of straight legs and exact coordinated turns: the state at the start of each.
+    """Constants of a flight of straight legs and exact coordinated turns: the state at the start of each leg.
 
-    The last one is straight and never ends.
+    The last leg is straight and never ends.
     """
 
     begins: Array
@@ -330,7 +299,7 @@ class Legs(NamedTuple):
 
 
 def _times(one: Array, other: Array) -> Array:
-    """Return the complex product of vectors ``(2, N)``, whose rows are real and imaginary part."""
+    """Return the product of complex numbers ``(2, N)``, whose rows are real and imaginary part."""
     return namespace(one).stack(
         [one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]]
     )
@@ -340,7 +309,7 @@ class LegCourse(Course):
     """Flights of stated legs, with start, direction, side and durations drawn around the stated ones."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Legs, Motion]:
-        """Return the legs of each flight, with drawn start, direction, side and durations, and the initial motion."""
+        """Draw start, direction, side and durations of each flight; return its legs and the initial motion."""
         xp, p = self.xp, self.parameters
         spread, course = p.start_spread, math.radians(p.course_spread)
         position = xp.stack(
@@ -361,19 +330,21 @@ class LegCourse(Course):
             turn = (math.radians(rate) * side) * ones
             flown = duration * draws.uniform(f"leg_{i}", (1.0 - p.leg_spread, 1.0 + p.leg_spread))
             begins.append(xp.concat([xp.stack([time, turn]), position, velocity]))
-            position, velocity = after(flown, turn, (position, velocity), self.task)
+            position, velocity = motion_in_turn(flown, turn, (position, velocity), self.task)
             time = time + flown
         begins.append(xp.concat([xp.stack([time, 0.0 * ones]), position, velocity]))
         return Legs(xp.stack(begins)), start
 
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
-        """Return the motion at a scan, also a fractional one, from the legs alone."""
+        """Return the motion at a scan, also a fractional one, computed from the legs alone."""
         now = self.parameters.sampling_interval * scan
         leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
-        return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
+        return motion_in_turn(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
-    def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Return deviations at a scan: a velocity deviation, rotated and scaled as the target's velocity is."""
+    def propagate_deviation(
+        self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array
+    ) -> Motion:
+        """Return the deviations at a scan that a velocity deviation causes, rotated and scaled as the velocity is."""
         before, now = early or (0.0, 0.0)
         (position, flown), (there, afterwards) = (
             self.advance(flight, time, (velocity, velocity)) for time in (scan - 1.0 - before, scan - now)
@@ -384,7 +355,7 @@ class LegCourse(Course):
         return _times(there - position, deviation), _times(afterwards, deviation)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context by name: starts of legs (s), turn rates (rad/s), and whether the target turns now."""
+        """Return the starts of legs (s), turn rates (rad/s), and whether the target turns now, by name."""
         now = self.parameters.sampling_interval * time
         turn = StepSignal(flight.turn, flight.time[1:]).at(now, self.xp)
         return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
@@ -394,7 +365,7 @@ class LegCourse(Course):
 
 
 class Table(Course):
-    """A flight given as a table of states at every scan."""
+    """A flight given as a table of positions and velocities at every scan."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -402,7 +373,7 @@ class Table(Course):
         """Rows x, y, vx, vy, ``(4, horizon + 2)``; several flights are concatenated."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Return the constants of the flight and the motion at its start, without a random number."""
+        """Return the constants of the flight, and the motion at its start, without a random number."""
         return None, (self.table[:2, 0, None] * ones, self.table[2:, 0, None] * ones)
 
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
@@ -412,17 +383,16 @@ class Table(Course):
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the motion on time, since a table has no states between its scans."""
+        """Return the motion of the scan on time, since a table has no states between scans."""
         return on_time
 
     def _states(self, column: Array) -> Motion:
-        """Return the positions and velocities in columns of the table, ``(2, N)`` each."""
         row = self.xp.astype(column, self.xp.int64)
         return self.table[:2, row], self.table[2:, row]
 
 
 class Tracks(NamedTuple):
-    """Choice of a flight in a table."""
+    """Constants of a flight: which one of a table it is."""
 
     number: Array
     """Index of the flight, ``(N,)``, a float, as are the columns of its first and last state."""
@@ -431,7 +401,7 @@ class Tracks(NamedTuple):
 
 
 class TableOfSeveral(Table):
-    """Flights given as one table of states, of which every episode flies one."""
+    """Several flights given as one table of states, of which every episode flies one."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -439,7 +409,7 @@ class TableOfSeveral(Table):
         """Columns of the table at which flights begin, and its width."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Tracks, Motion]:
-        """Return the drawn choice of a flight for each episode, and the motion at its start."""
+        """Draw one of the table's flights for each episode; return the choice, and the motion at its start."""
         constant = self.task.constant
         number = draws.integer("flight", (0, len(self.ends) - 2))
         row = self.xp.astype(number, self.xp.int64)
@@ -451,7 +421,7 @@ class TableOfSeveral(Table):
         return self._states(self.xp.minimum(flight.first + scan, flight.last))
 
     def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context: the index of the flight, by name."""
+        """Return the index of the flight, by name."""
         return {"flight": flight.number}
 
 

@@ -14,7 +14,7 @@ from .parameters import ManeuveringTargetParameters
 
 
 class ColouredScanErrorsState(NamedTuple):
-    """State of :class:`ColouredScanErrors`."""
+    """Coloured errors of the scans: standard deviation, correlation time, current errors."""
 
     deviation: Array
     """Stationary standard deviation, ``(N,)``."""
@@ -25,7 +25,7 @@ class ColouredScanErrorsState(NamedTuple):
 
 
 class ColouredScanErrors(Disturbance):
-    """Errors that are correlated from scan to scan, added to the white ones."""
+    """Disturbance by errors that are correlated from scan to scan, added to the white ones."""
 
     name = "coloured"
     initial_normals = 2
@@ -37,7 +37,7 @@ class ColouredScanErrors(Disturbance):
         return parameters.coloured
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ColouredScanErrorsState:
-        """Return the drawn standard deviation, correlation time and stationary initial errors."""
+        """Draw the standard deviation, correlation time and stationary initial errors."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
         calm = draw_undisturbed(draws, p)
@@ -57,12 +57,12 @@ class ColouredScanErrors(Disturbance):
         return errors + state.level
 
     def context(self, state: ColouredScanErrorsState) -> dict[str, Array]:
-        """Return the context: the standard deviation of the coloured errors, by name."""
+        """Return the standard deviation of the coloured errors, by name."""
         return {"coloured_sigma": state.deviation}
 
 
 class Bias(Disturbance):
-    """Constant errors in all scans of an episode; they are its state, ``(2, N)``."""
+    """Disturbance by errors that are constant in an episode; they are its state, ``(2, N)``."""
 
     name = "bias"
 
@@ -72,7 +72,7 @@ class Bias(Disturbance):
         return parameters.bias > 0.0
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return the drawn constant sensor errors, ``(2, N)``."""
+        """Draw the constant sensor errors, ``(2, N)``."""
         return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
 
     def change_errors(self, state: Array, errors: Array) -> Array:
@@ -80,7 +80,7 @@ class Bias(Disturbance):
         return errors + state
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the context: the constant errors, by name."""
+        """Return the constant errors, by name."""
         return {"bias": state}
 
 

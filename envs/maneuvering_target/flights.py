@@ -19,7 +19,6 @@ MOST_SCANS = 100_000
 
 
 def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
-    """Return a scenario that flies a user's trajectory, sampled once a scan and straight beyond its end."""
     interval, _, horizon = _sampling(keywords)
     farthest = float(numpy.hypot(*trajectory.position.T).max())
     if farthest > FARTHEST_RANGE:
@@ -43,9 +42,7 @@ def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any])
 
 
 def _sampling(keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
-    """Return the sampling interval (s), the scans for which one action holds, and the horizon or None, from
-    keywords.
-    """
+    """Return sampling interval (s), scans for which one action holds, and horizon or None, from keywords."""
     found: dict[str, Any] = {}
     for name in ("sampling_interval", "decision_interval", "horizon"):
         found[name] = getattr(ManeuveringTargetParameters, name) if name != "horizon" else None
@@ -56,7 +53,7 @@ def _sampling(keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
 
 
 def scenario_of_flights(flights: Trajectory | Flights, keywords: Mapping[str, Any]) -> Scenario:
-    """Return a scenario in which every episode flies one of a user's flights, to its end or for the horizon."""
+    """Return a scenario in which every episode flies one of a user's flights, to its end or the horizon."""
     if isinstance(flights, Trajectory):
         return _scenario_of_trajectory(flights, keywords)
     interval, held, horizon = _sampling(keywords)

@@ -53,7 +53,7 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank, RadarBank):
-    """Bank of the control ``hypotheses``: the semi-Markov Gaussian sum with factors on weights, covariances and R."""
+    """Bank of the control ``hypotheses``: estimator ``semi-markov`` with factors on weights, covariances and R."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
 
@@ -74,7 +74,7 @@ class HypothesesBank(SettingsBank, RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovation, predicted deviation, and probabilities of groups of hypotheses."""
+        """Observation blocks, such as innovation, predicted deviation, and probabilities of the hypotheses."""
         xp = self.xp
         area = 2.0 * math.pi * self.parameters.range_sigma**2
         return (
@@ -105,7 +105,7 @@ class HypothesesBank(SettingsBank, RadarBank):
         return HypothesesState(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:
-        """Return the probabilities of groups of hypotheses, ``(G, N)``, from those of all hypotheses, ``(H, N)``."""
+        """Sum the probabilities of all hypotheses, ``(H, N)``, to those of observed groups, ``(G, N)``."""
         return self.xp.stack(
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )
@@ -113,7 +113,7 @@ class HypothesesBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: HypothesesState, result: SemiMarkovState, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the innovation, and the probabilities before and after it, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the scan, filled in."""
         xp, tables = self.xp, [table.unpack() for table in state.own.track]
         weights = xp.concat([table.probability for table in tables])
         weights = weights / ordered_sum(weights)

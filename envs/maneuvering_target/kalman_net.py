@@ -13,14 +13,13 @@ the frame of the predicted velocity (along it, and across it to the left, a rota
 
 All zero is the Kalman filter of constant velocity under white acceleration. Without a measurement K is zero.
 
-The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering for
-Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547; the covariance by Joseph's form with that
-gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman Filtering
-for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks output the gain itself,
-here the network outputs the noises of a Kalman gain, so that an untrained network is a working filter. These differ
-from the noises of the covariance: the best values for one need not be the best for the other. (Factors of the gain's
-rows were as good, but could make the filter diverge.) Their dynamics are given; here the network also outputs the
-acceleration, the unknown part of the dynamics.
+The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering
+for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547; the covariance by Joseph's form with
+that gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman
+Filtering for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks output the
+gain itself, here the network outputs the noises of a Kalman gain, so that an untrained network is a working filter.
+These differ from the noises of the covariance: the best values for one need not be the best for the other. Their
+dynamics are given; here the network also outputs the acceleration.
 """
 
 import math
@@ -85,7 +84,7 @@ STANDING = 1e-3
 
 
 def speed_of(velocity: Array, least: float = STANDING) -> Array:
-    """Return the speed, ``(N,)``, m/s, smoothly limited from below by ``least``."""
+    """Return the speed, ``(N,)``, m/s, of a velocity, smoothly limited from below by ``least``."""
     return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
 
 
@@ -104,12 +103,10 @@ def frame_of(velocity: Array) -> Array:
 def sensor_blocks(
     bank: Any, variances: Callable[..., Array], coupling: Callable[..., Array]
 ) -> Sequence[Block]:
-    """Return the observation blocks of a measurement's covariance in the frame of the velocity.
+    """Return the observation blocks of a measurement's covariance along and across the velocity.
 
-    Args:
-        bank: with these blocks.
-        variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
-        coupling: the correlation, ``(N,)``.
+    ``variances`` along and across, ``(2, N)``, m^2, and ``coupling``, the correlation, are functions of state and
+    measurement.
     """
     xp, p = bank.xp, bank.parameters
     return (
@@ -125,9 +122,7 @@ def sensor_blocks(
 
 
 def clock_blocks(bank: Any) -> Sequence[Block]:
-    """Return the observation blocks of predicted speed, scan number, detection and interval, for a bank with a
-    ``mean``.
-    """
+    """Return the observation blocks of predicted speed, scan number, detection and interval of a bank."""
     xp, p = bank.xp, bank.parameters
     return (
         Block(
@@ -158,7 +153,7 @@ def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
 
 
 def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
-    """Return the mean predicted with a constant acceleration along and across: a turn, and a change of speed.
+    """Return the mean after a turn and change of speed by an acceleration, and the given mean with turn rate.
 
     Args:
         mean: x, y (m), vx, vy (m/s), ``(4, N)``.
@@ -166,7 +161,7 @@ def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
         T: interval, s, ``(N,)``.
 
     Returns:
-        The predicted mean, and the mean before with the turn rate as fifth state, ``(5, N)``.
+        The predicted mean, and the given mean with the turn rate as fifth state, ``(5, N)``.
     """
     xp = namespace(mean)
     rate = 1.0 / speed_of(mean[2:], LEAST_SPEED)
@@ -178,7 +173,7 @@ def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
 
 
 class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
-    """Bank of ``kalman-net``: an extended Kalman filter, whose noises, gain and motion the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises, gain and motion of a Kalman filter."""
 
     parameters: ManeuveringTargetParameters
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
@@ -192,7 +187,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovations, their predicted and measured deviations, the last action, and the time."""
+        """Observation blocks, such as innovation, last correction, predicted and measured deviations, and the time."""
         xp, p = self.xp, self.parameters
         return (
             innovation_block(FRAME, value=lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor)),
@@ -222,7 +217,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def start(self, initial: Initial) -> KalmanNetState:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none
@@ -253,12 +248,9 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def noise(self, frame: Array, deviation: Array, T: Array) -> Array:
-        """Return the process noise covariance of accelerations along and across over intervals, ``(4, 4, N)``.
+        """Return the process noise covariance of accelerations along and across, over intervals, ``(4, 4, N)``.
 
-        Args:
-            frame: rows along and across, ``(2, 2, N)``.
-            deviation: of each, m/s^2, ``(2, N)``.
-            T: s, ``(N,)``.
+        ``frame`` has the rows along and across, ``(2, 2, N)``; ``deviation`` is of each, m/s^2, ``(2, N)``.
         """
         xp = self.xp
         variance = deviation * deviation
@@ -268,9 +260,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
     def act(self, state: KalmanNetState, measurement: Measurement, action: Array) -> KalmanNetState:
-        """Return the state updated with the gain that the action sets, with its acceleration for the next
-        prediction.
-        """
+        """Return the state updated with noises and gain of the action, whose acceleration the next prediction uses."""
         xp, available = self.xp, measurement.available
         a = xp.clip(action, -1.0, 1.0)
         frame = frame_of(state.mean[2:])

@@ -25,16 +25,14 @@ def choose(condition: Any, first: Any, second: Any) -> Any:
 
 
 def is_finite(number: Any) -> Any:
-    """Return whether a float, or every number of an array, is finite."""
+    """Return whether a float, or each number of an array, is finite."""
     return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
 
 
 class PlotInput(LiveInput):
-    """Converter of plots, ``x`` and ``y`` or ``range`` and ``azimuth``, or none, into measurements.
+    """Converter of live radar plots, ``x`` and ``y`` or ``range`` and ``azimuth``, into measurements.
 
-    With the setup of a log of ``latitude`` and ``longitude`` it accepts these instead.
-
-    A filter whose file was advised for a log of ``latitude`` and ``longitude`` takes these in their place.
+    A filter that was advised for a log of ``latitude`` and ``longitude`` accepts these instead.
     """
 
     counter = "scan"
@@ -80,12 +78,10 @@ class PlotInput(LiveInput):
         return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
 
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the velocity by the second sensor, m/s, ``(2, N)``, of one track ``(2,)``; NaN where it has none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
         return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return x and y of a plot from its Cartesian or polar values, m; NaN where there is none."""
         if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:
@@ -95,7 +91,7 @@ class PlotInput(LiveInput):
         return (x, y) if self.lanes else (float(x), float(y))
 
     def _project(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return x and y of a latitude and longitude, m, around the origin of the log in the filter's setup."""
+        """Return x and y, m, of a latitude and longitude, around the origin of the log in the filter's setup."""
         twice = [name for name in VALUES[:4] if name in values]
         if twice:
             raise ValueError(f"a plot has {twice[0]} and latitude or longitude: leave one of them out")
@@ -114,7 +110,7 @@ class PlotInput(LiveInput):
         return tuple(position) if self.lanes else tuple(position[:, 0].tolist())
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Return the initial mean and covariance by name: the second plot, and the velocity between the two plots."""
+        """Return the initial mean and covariance by name: the second plot, and the velocity between the two."""
         plots = [{name: value for name, value in plot.items() if name != "time"} for plot in (first, second)]
         position = numpy.reshape([self._position(plot) for plot in plots], (2, 2, self.tracks))
         lasted = second["time"] - first["time"]
@@ -134,9 +130,7 @@ class PlotInput(LiveInput):
         return {name: numpy.moveaxis(values, 0, -1) for name, values in begun.items()}
 
     def _variance(self, position: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the variances of a plot, m^2: those stated with it, else those of the filter's setup, else the
-        radar's.
-        """
+        """Return the variances of a plot, m^2: those stated with it, or of the filter's setup, or the radar's."""
         p, usual = self.parameters, dict(self.task.recording.deviations)
         readings = LiveValues(self, values)
         stated = [readings.deviations("sigma_x"), readings.deviations("sigma_y")]

@@ -132,8 +132,7 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
-    """Return the median stated deviation as parameter ``range_sigma``; empty if none is stated or it equals the
-    radar's.
+    """Return the median stated deviation as ``range_sigma``; empty if none is stated or it equals the radar's.
 
     Agents observe deviations relative to it, and errors cost in units of its square.
     """
@@ -145,15 +144,10 @@ def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
 
 
 def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray) -> numpy.ndarray:
-    """Return booleans ``(rows,)``: positions that repeat those of the previous row and are no new measurement.
+    """Return booleans ``(rows,)``: positions that repeat the previous row's and are no new measurement.
 
     A receiver at rest may report the same numbers again. So they are stale only where noise of the stated size, in the
     resolution of the numbers, would hardly ever repeat both.
-
-    Args:
-        columns: of one track.
-        position: m, ``(rows, 2)``; NaN where there is none.
-        sigma: standard deviations of their errors, m, ``(rows, 2)``.
     """
     measured = position
     if columns.origin is not None:  # x and y change with altitude, too
@@ -194,10 +188,10 @@ def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
 def two_plot_start(
     position: numpy.ndarray, variance: numpy.ndarray, lasted: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
-    """Return the initial mean and covariance from two plots: the second, and their difference over the time, by name.
+    """Return the initial mean and covariance by name from two plots: the second, and the velocity between both.
 
     Args:
-        position: of the two, ``(..., 2, 2)``, m.
+        position: positions of the two plots, ``(..., 2, 2)``, m.
         variance: of their errors, m^2, same shape.
         lasted: s, ``(..., 1)``.
     """
@@ -215,10 +209,10 @@ def two_plot_start(
 def start_track(
     measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
 ) -> TrackStart:
-    """Return the start of every episode from its first two plots.
+    """Return the start of every episode of a log, from its first two plots.
 
     Raises:
-        ValueError: if there are none.
+        ValueError: if there are fewer.
     """
     if seconds.shape[1] < 3 or not numpy.isfinite(seconds[:, :3]).all():
         raise ValueError("an episode without initial_mean starts from its first two plots, and needs a third")
@@ -256,7 +250,7 @@ def _positions(columns: Columns) -> numpy.ndarray:
 
 
 def east_north(length: numpy.ndarray, angle: numpy.ndarray) -> numpy.ndarray:
-    """Return the vector east and north, ``(2, n)``, of lengths and angles clockwise from north, rad, ``(n,)`` each."""
+    """Return vectors east and north, ``(2, n)``, of lengths and angles clockwise from north, rad, ``(n,)``."""
     return numpy.stack([length * numpy.sin(angle), length * numpy.cos(angle)])
 
 
@@ -265,11 +259,6 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
     It is that of ``--set range_sigma``, else the scatter of positions about the line through their neighbours, which
     motion can only increase.
-
-    Args:
-        columns: of one track.
-        position: of its plots, m, ``(n, 2)``.
-        time: s, ``(n,)``.
     """
     if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
@@ -279,7 +268,6 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Return the typical deviations of the plots by column name, and the source of these numbers in words."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
@@ -298,7 +286,6 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
-    """Return notes on the assumed deviations, where neither a column nor the user states one."""
     if not is_assumed(source) or "range_sigma" in columns.user_parameters:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
@@ -307,9 +294,7 @@ def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source:
 def _variances(
     columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
 ) -> numpy.ndarray:
-    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation,
-    m.
-    """
+    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN without a plot. ``assumed`` is a deviation, m."""
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
         variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
@@ -332,7 +317,7 @@ def _variances(
 
 
 def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the row and the time of every scan after the start; scans inserted evenly into gaps have row -1."""
+    """Return row and time of every scan after the start; scans inserted evenly into gaps have row -1."""
     before, now = columns.time[first:-1], columns.time[first + 1 :]
     scans = numpy.maximum(numpy.rint((now - before) / interval).astype(int), 1)
     if scans.max() > LARGEST_GAP + 1:
@@ -349,12 +334,6 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the times since the previous scan and since the last scan with a plot, s, by name.
-
-    Args:
-        time: of the start, and of the scans, ``(1 + T,)``.
-        seen: whether a scan has a plot, ``(T,)``.
-    """
     import pandas
 
     last = pandas.Series(numpy.where([True, *seen], time, numpy.nan)).ffill().to_numpy()[:-1]
@@ -364,10 +343,7 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]:
     """Return the displacement between scans by a second sensor, by name; empty if there is none.
 
-    Args:
-        columns: of one track.
-        rows: of the scans, ``(T,)``, -1 for a scan that has no row: the displacement until the next row is divided
-            evenly.
+    For a scan without a row, -1, the displacement until the next row is divided evenly.
     """
     moved = _displacements(columns)
     if moved is None:
@@ -383,7 +359,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Return the displacement since the previous row by the second sensor, m, ``(rows, 2)``; NaN where it has none."""
+    """Return the second sensor's displacement since the previous row, m, ``(rows, 2)``; None if there is no sensor."""
     if columns.has("odometry_x", "odometry_speed"):
         raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
     if columns.has("odometry_x"):
@@ -398,12 +374,12 @@ def _displacements(columns: Columns) -> numpy.ndarray | None:
 
 
 def scale_noise(measurement: Any, factor: Any) -> Any:
-    """Return a measurement with its stated deviations multiplied by a factor."""
+    """Return a measurement whose stated standard deviations are multiplied by a factor."""
     return measurement._replace(variance=measurement.variance * factor**2)
 
 
 def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Return the position that an estimate predicts for a measurement, and the measured one, m, ``(2, N)`` each."""
+    """Return the position that an estimate predicts at a scan, and the measured one, m, ``(2, N)`` each."""
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
 

@@ -15,7 +15,7 @@ covariances up to some 3000 (``filters/contaminated_normal.py``), and a normal n
 
 @dataclass(frozen=True)
 class ManeuveringTargetParameters(TaskParameters):
-    """Constants of the task; each is a keyword of ``gym.make``."""
+    """Constants of ManeuveringTarget; each is a keyword of ``gym.make``."""
 
     sampling_interval: float = parameter(6.0, above=0.0, at_most=86400.0)
     """Scan period T, s (paper)."""
@@ -135,23 +135,23 @@ class ManeuveringTargetParameters(TaskParameters):
 
     @property
     def regular(self) -> bool:
-        """Return whether every scan comes on time and sees the target, without clutter."""
+        """Whether every scan comes on time and sees the target, without clutter."""
         on_time = self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
         return on_time and not self.cluttered
 
     @property
     def cluttered(self) -> bool:
-        """Return whether the radar reports false plots (clutter)."""
+        """Whether the radar reports false plots (clutter)."""
         return self.clutter_density[1] > 0.0
 
     @property
     def coloured(self) -> bool:
-        """Return whether measurement errors may be correlated from scan to scan."""
+        """Whether measurement errors may be correlated from scan to scan."""
         return self.coloured_sigma[1] > 0.0
 
     @property
     def window_area(self) -> float:
-        """Area of the window of plots, m^2."""
+        """Area of the window in which clutter is simulated, m^2."""
         return (2.0 * self.clutter_window) ** 2
 
     def check(self) -> None:

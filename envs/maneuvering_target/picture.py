@@ -48,7 +48,7 @@ KINDS = {
 
 
 def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
-    """Return the standard deviations along the two principal axes, larger first, and the direction of the larger.
+    """Return the axes of a covariance ellipse: two standard deviations, larger first, and the larger's direction.
 
     Args:
         covariance: ``(2, 2)``.
@@ -79,7 +79,7 @@ class ManeuveringTargetPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the values that the time series and the track show at a scan, by name; positions in km."""
+        """Return the values that the picture shows at a scan, by name; positions in km."""
         estimator = state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
@@ -143,7 +143,7 @@ class ManeuveringTargetPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series of innovation, gain or weights, and error."""
+        """Return the time series of the picture: innovation, gain or weights, and error."""
         axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
@@ -176,11 +176,11 @@ class ManeuveringTargetPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return False: the time series show the filter's quantities instead of the observation."""
+        """Return False: the picture shows the filter's quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the first and last scan of each manoeuvre, which are shaded."""
+        """Return the first and last scan of each manoeuvre, which the picture shades."""
         return self.maneuvers
 
     # --- panels
@@ -262,7 +262,7 @@ class ManeuveringTargetPicture(Picture):
         self.close_up.set_ylim(-reach, reach)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Update the track, the close-up and their texts to the current scan."""
+        """Update track, close-up and their texts to the current scan."""
         seen = int(state.measurement.available[0])
         self.arrived.set_data(*(state.measurement.position[:, :seen] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}

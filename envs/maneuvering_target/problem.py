@@ -18,5 +18,4 @@ class TargetProblem(Task):
         """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
 
     def _sampling_interval(self) -> float | None:
-        """Return the constant time between scans, s; None where scans may miss the target or come early."""
         return self.parameters.sampling_interval if self.regular else None

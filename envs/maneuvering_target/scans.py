@@ -16,7 +16,7 @@ from .parameters import ManeuveringTargetParameters
 
 
 class Scan(NamedTuple):
-    """A scan of the radar."""
+    """A scan of the radar: motion at its time, whether it sees the target, times since earlier ones."""
 
     motion: Motion
     """Motion of the target at the time of the scan."""
@@ -29,11 +29,10 @@ class Scan(NamedTuple):
 
 
 class RegularScans:
-    """Scans that all come on time and see the target.
+    """Simulation of radar scans that all come on time and see the target.
 
     Args:
         task: with the scan period.
-        course: that the target flies.
 
     Attributes:
         row_uniforms: uniform numbers that a scan takes.
@@ -48,36 +47,31 @@ class RegularScans:
         self.course = course
 
     def begin(self, draws: Draws, motion: Motion) -> Any:
-        """Return the scan quantities of an episode, whose track begins with a measurement on time: here None."""
+        """Return the random constants of an episode's scans: here None."""
         return None
 
     def advance(
         self, scans: Any, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Any, Scan]:
-        """Return the state of the scans and the next :class:`Scan`, with the target moved along its course.
+        """Move the target to the next scan; return the state of the scans, and the :class:`Scan`.
 
-        Args:
-            scans: of :meth:`begin`, or the scan before.
-            flight: of the course.
-            number: of the scan, ``(N,)``.
-            before: motion at the time of the scan before.
-            uniforms: ``(row_uniforms, N)``.
+        ``before`` is the motion at the time of the previous scan.
         """
         always = self.xp.ones_like(number)
         interval = self.parameters.sampling_interval * always
         return None, Scan(self.course.advance(flight, number, before), always, interval, interval)
 
     def time(self, scans: Any, number: Array) -> Array:
-        """Return the time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``: its number."""
         return number
 
     def context(self, scans: Any) -> dict[str, Array]:
-        """Return the context of the scans by name: here empty."""
+        """Return the random draws of the scans by name: here none."""
         return {}
 
 
 class Reliability(NamedTuple):
-    """State of scans that may miss the target and come early."""
+    """State of radar scans that may miss the target and come early."""
 
     detection_probability: Array
     """Probability that a scan sees the target, ``(N,)``."""
@@ -93,12 +87,12 @@ class Reliability(NamedTuple):
 
 
 class UnreliableScans(RegularScans):
-    """Scans that may miss the target and come early, each independent of the others."""
+    """Simulation of radar scans that may miss the target and come early, each independent of the others."""
 
     row_uniforms = 2
 
     def begin(self, draws: Draws, motion: Motion) -> Reliability:
-        """Return the drawn detection probability and the largest share of the period by which scans come early."""
+        """Draw the detection probability, and the largest share of the period by which scans come early."""
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
@@ -108,7 +102,7 @@ class UnreliableScans(RegularScans):
     def advance(
         self, scans: Reliability, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Reliability, Scan]:
-        """Return the state of the scans and the next :class:`Scan`, which may be early or miss the target."""
+        """Move the target to the next scan; return the state of the scans, and the :class:`Scan`."""
         before = scans.position, scans.velocity
         on_time = self.course.advance(flight, number, before)
         early = scans.jitter * uniforms[1]
@@ -127,12 +121,12 @@ class UnreliableScans(RegularScans):
         return number - scans.early
 
     def context(self, scans: Reliability) -> dict[str, Array]:
-        """Return the context by name: detection probability, and the largest share of the period of early scans."""
+        """Return detection probability, and the largest share of the period by which scans come early, by name."""
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
 
 
 def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
-    """Return whether every scan of a recording has a plot and all are exactly one sampling interval apart."""
+    """Return whether every scan of a recording has a plot and comes one sampling interval after the previous."""
     if isinstance(recording, Feed):
         return recording.regular
     there = numpy.isfinite(recording.seconds)

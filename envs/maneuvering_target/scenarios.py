@@ -2,10 +2,9 @@
 
 Windows are scan numbers, first and last included. The flights of ``atc``, ``cruise`` and ``descent`` are legs that no
 training episode contains: duration straight or turning (s) and turn rate (deg/s, anticlockwise positive), flown
-exactly. Start, direction, side and durations are drawn for each episode around the stated ones, so that a policy cannot
-memorise a flight. ``paper`` is as printed, always the same flight, which a policy could memorise. In
-``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault of a stated
-strength. The same holds for ``glint``, ``biased`` and ``clutter``, whose faults no training episode contains.
+exactly. Start, direction, side and durations are drawn for each episode around the stated ones. ``paper`` is always
+the same flight. In ``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has
+one fault of a stated strength; so in ``glint``, ``biased`` and ``clutter``, whose faults no training episode contains.
 """
 
 from collections.abc import Mapping

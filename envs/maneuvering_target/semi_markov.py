@@ -2,9 +2,9 @@
 age.
 
 Equations: ``filters/semi_markov.py``. Constant thrust and coordinated turns are the manoeuvres of the training
-distribution; the filter's parameters are its prior of them. It is the estimator ``semi-markov`` of the baselines, and
-the filter that the control ``hypotheses`` steers. H hypotheses of kind and age predict to the scan with weights p',
-means x' and covariances P'. Factors f of its settings change the update with this measurement alone:
+distribution; the filter's parameters are its prior of them. The control ``hypotheses`` steers this estimator,
+``semi-markov``. H hypotheses of kind and age predict to the scan with weights p', means x' and covariances P'. Factors
+f of its settings change the update with this measurement alone:
 
     p'(h) <- p'(h) f1^begun(h) f2^ended(h) f3^turning(h)                                    renormalised by Bayes' rule
     P'(h) <- P'(h) f4 in straight flight, P'(h) f5 in manoeuvres,    R <- R f6
@@ -40,7 +40,7 @@ SLOWEST = 30.0
 
 
 class SemiMarkovPrior(NamedTuple):
-    """Prior of a semi-Markov filter on the flights."""
+    """Prior of a semi-Markov filter on the flights: hazards and sizes of manoeuvres."""
 
     begin: float = 0.0157
     """Probability that a manoeuvre begins before a scan."""
@@ -97,8 +97,7 @@ def training_prior(hypotheses: int) -> SemiMarkovPrior:
     """Return the prior of the training distribution for a filter of few hypotheses.
 
     Manoeuvres have one age: thrust, and from nine hypotheses on a turn to either side. All others are ages of straight
-    flight, which matter most: they keep false manoeuvres apart. Of the divisions of 3, 5, 9 and 15 that were tried on
-    the validation split this costs least, or within chance of it.
+    flight, which matter most: they keep false manoeuvres apart.
 
     Args:
         hypotheses: H, at least 2.
@@ -120,7 +119,7 @@ turn rate."""
 
 
 class Turn(NamedTuple):
-    """A kind of turn: its acceleration and share."""
+    """A kind of turn: its acceleration and its share of all turns."""
 
     acceleration: float
     """Mean acceleration, to the left positive, m/s^2."""
@@ -131,7 +130,7 @@ class Turn(NamedTuple):
 
 
 class SemiMarkovState(NamedTuple):
-    """State of the semi-Markov filter."""
+    """State of the semi-Markov filter: estimate, hypotheses with their ages, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(4, N)``."""
@@ -143,15 +142,13 @@ class SemiMarkovState(NamedTuple):
 
 
 class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measurement, SemiMarkovState]):
-    """Gaussian sum over straight flight, constant thrust and coordinated turns, each with the time since it began.
+    """Estimator ``semi-markov``: Gaussian sum over straight flight, constant thrust and turns, each with its age.
 
-    Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
-    distribution, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
-    and steep ones: about a turn rate of zero the extended filter would linearise where no turn is.
+    Every hypothesis of kind and age has a Kalman filter, an extended one of the turn. Turns to the left and to the
+    right are kinds of their own, and so are gentle and steep ones: about a turn rate of zero the extended filter would
+    linearise where no turn is.
 
     Args:
-        task: the problem.
-        prior: of flights and measurements.
         **changed: fields of the prior.
     """
 
@@ -183,7 +180,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         """Mask of the hypotheses whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:
-        """Return the state at the start: the initial estimate, in straight flight for long."""
+        """Return the filter's state at the start: the initial estimate, in straight flight for long."""
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
 
@@ -206,25 +203,23 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(initial.mean, initial.covariance, Likelihood.unknown(none), packed)
 
     def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return the state extended by an unknown acceleration, mean ``(6, N)`` and covariance ``(6, 6, N)``."""
+        """Return the state extended by an unknown acceleration: mean ``(6, N)``, covariance ``(6, 6, N)``."""
         none = 0.0 * mean[:2]
         variance = self.prior.thrust**2 + none[0]
         return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
 
     def begin_turn(self, mean: Array, covariance: Array, turn: Turn) -> tuple[Array, Array]:
-        """Return the state extended by the turn rate of a kind of turn, mean ``(5, N)`` and covariance ``(5, 5,
-        N)``.
-        """
+        """Return the state extended by the turn rate of a kind of turn: mean ``(5, N)``, covariance ``(5, 5, N)``."""
         pace = self.xp.sqrt(self.squared_pace(mean))
         rate = turn.acceleration / pace
         return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(turn.spread / pace) ** 2])
 
     def squared_pace(self, mean: Array) -> Array:
-        """Return the square of the speed by which accelerations of turns are divided, (m/s)^2."""
+        """Return the squared speed, (m/s)^2, that converts accelerations of turns to turn rates."""
         return self.xp.clip(mean[2] ** 2 + mean[3] ** 2, SLOWEST**2, None)
 
     def augment(self, covariance: Array, variances: list[Array]) -> Array:
-        """Return the covariance of a state extended by further components, independent of it and of each other."""
+        """Return the covariance of a state extended by components that are independent of it and each other."""
         n, none = covariance.shape[0], 0.0 * variances[0]
         size = range(n + len(variances))
         return self.xp.stack(
@@ -256,7 +251,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         straight, (thrust, *kinds) = semi_markov.switch(straight, modes)
         return straight, thrust, *([semi_markov.join(kinds)] if kinds else [])
 
-    def fly(
+    def predict_hypotheses(
         self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses, T: Array
     ) -> Tables:
         """Return the hypotheses predicted over an interval (s), each by its kind of motion."""
@@ -280,21 +275,19 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return tuple(moved)
 
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
-        """Return the hypotheses predicted to the scan, after manoeuvres have begun and ended."""
+        """Return the hypotheses predicted to the scan, after manoeuvres may have begun or ended."""
         switched = self.switch(*(table.unpack() for table in state.track))
-        tables = self.fly(*switched, T=measurement.interval)
+        tables = self.predict_hypotheses(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where the scan saw the target, so that an action has an effect, zero elsewhere, ``(N,)``."""
+        """Return 1 where the scan saw the target, so that an action has an effect, else 0, ``(N,)``."""
         return measurement.available
 
     def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:
-        """Return the hypotheses with weights and covariances multiplied by factors.
+        """Return the hypotheses with weights and covariances multiplied by the action's factors.
 
-        Args:
-            tables: the hypotheses.
-            logarithms: of the factors, ``(5, N)``.
+        ``logarithms`` are those of the factors, ``(5, N)``.
         """
         factors = self.xp.exp(ordered_sum(self.raised * logarithms[:3, None]))
         straight, manoeuvre = self.xp.exp(logarithms[3:])
@@ -308,7 +301,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return scaled
 
     def update(self, state: SemiMarkovState, inputs: FilterInput) -> SemiMarkovState:
-        """Return the state with all hypotheses and their weights updated with a measurement.
+        """Return all hypotheses and their weights updated with a measurement.
 
         Its normalised innovation squared is the mean of the filters', by their posterior weights.
         """
@@ -337,7 +330,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(mean, covariance, likelihood, track)
 
     def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
-        """Return every hypothesis updated with the measured position, or as predicted without one."""
+        """Return the hypotheses of one kind updated with the measured position, or unchanged without one."""
         result = contaminated_normal.update_position(
             table.mean,
             table.covariance,
@@ -350,5 +343,4 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
 
 def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
-    """Return the hypotheses with the mean and covariance of the time update."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

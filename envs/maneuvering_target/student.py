@@ -2,8 +2,7 @@
 
 The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
 unit of a position is the measurement's sigma in the frame; that of a velocity is this sigma over the scan period. The
-network outputs the acceleration until the next scan, along and across. A rotation or shift of the whole problem rotates
-or shifts the estimates.
+network outputs the acceleration until the next scan, along and across.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ ACCELERATION_REACH = 32.0
 
 
 class RadarStudentBank(StudentBank[object, Measurement]):
-    """Bank of ``student``: position and velocity of an aircraft, corrected in the frame of its velocity."""
+    """Bank of the learned estimator ``student``: an aircraft's estimate, corrected in its velocity's frame."""
 
     parameters: ManeuveringTargetParameters
     # An alpha-beta filter without training: a half, and a quarter of the innovation over the scan period.
@@ -37,7 +36,7 @@ class RadarStudentBank(StudentBank[object, Measurement]):
     motions: ClassVar[Sequence[int]] = (2, 3)
 
     def rotate(self, mean: Array) -> Array:
-        """Return the rotation of positions and velocities into the frame, ``(4, 4, N)``."""
+        """Return the rotation of positions and velocities into the frame of the velocity, ``(4, 4, N)``."""
         turn = frame_of(mean[2:])
         none = 0.0 * turn
         sides = [[turn, none], [none, turn]]
@@ -73,5 +72,5 @@ class RadarStudentBank(StudentBank[object, Measurement]):
         return (*sensor_blocks(self, variances, coupling), *clock_blocks(self))
 
     def turned_covariance(self, turn: Array, measurement: Measurement) -> Array:
-        """Return the covariance of a measurement in the frame, m^2, ``(2, 2, N)``."""
+        """Return a measurement's covariance in the frame of the velocity, m^2, ``(2, 2, N)``."""
         return product(product(turn, sensor_covariance(measurement, self.xp)), transpose(turn))

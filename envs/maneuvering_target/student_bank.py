@@ -9,12 +9,11 @@ motion output and nu the innovation over the sensor's sigma, zero where nothing 
     m_l = G_i a_l report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_ii,  L_ij = coupling_reach L_ii
     a_ij  (j < i)
 
-with a in [-1, 1] the network's outputs, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach a)
-and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are output as logits, and
-other terms of a component are in units of its gain: in straight flight the best gains are some thousandths, and any
-larger term makes the estimate drift. Because all inputs and outputs are relative to the frame, the estimator is as
-symmetric as the frame is. Its stability is not guaranteed: a Kalman filter's gain follows from a covariance, and this
-one loses the track where its network outputs a wrong gain.
+with a in [-1, 1] the network's outputs, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach
+a) and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are output as logits,
+and other terms of a component are in units of its gain: in straight flight the best gains are some thousandths, and
+any larger term makes the estimate drift. Its stability is not guaranteed: it loses the track where its network outputs
+a wrong gain.
 
 A network that is trained through its own recursive estimate is that of Haarnoja and others, "Backprop KF: Learning
 Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs outputs the measurement of a Kalman filter.
@@ -57,7 +56,7 @@ class View(NamedTuple):
 
 
 class StudentState(NamedTuple):
-    """State of the learned estimator."""
+    """State of the learned estimator: estimate, covariance and network outputs."""
 
     mean: Array
     """Mean, ``(C, N)``; predicted between :meth:`StudentBank.predict` and the action."""
@@ -70,7 +69,7 @@ class StudentState(NamedTuple):
 
 
 class StudentBank(Bank[TaskT, Measurement, StudentState]):
-    """Base class of the banks of ``student``: an estimate that the action corrects.
+    """Base class of the banks of ``student``, a learned estimator whose estimate the action corrects.
 
     A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`,
     :meth:`predict_view`), and further features (:attr:`features`).
@@ -91,7 +90,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
 
     @abstractmethod
     def rotate(self, mean: Array) -> Array:
-        """Return the rotation U into the frame at an estimate, ``(C, C, N)``; an identity without a frame."""
+        """Return the rotation U into the frame of an estimate, ``(C, C, N)``; an identity without a frame."""
 
     @abstractmethod
     def predict_view(self, mean: Array, motion: Array, measurement: Any) -> View:
@@ -118,8 +117,8 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
     def blocks(self) -> Sequence[Block]:
         """Observation blocks: the innovation and the features, without the last action.
 
-        At the beginning of training the outputs vary little. As observations they would be normalised by that small
-        spread, and their gradients would grow with every scan in the backward pass.
+        Outputs vary little at the beginning of training: normalised by that spread, their gradients would grow with
+        every scan.
         """
         return (
             Block(
@@ -133,7 +132,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def start(self, initial: Initial) -> StudentState:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the estimator's state at the start of the track, from the initial estimate."""
         frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)
@@ -173,7 +172,6 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def _correct(self, by_gain: Array, offset: Array, innovation: Array) -> tuple[list[Array], Array]:
-        """Return the gain G of each component, and the correction c, ``(C, N)``."""
         gains, corrections = [], []
         for row, beyond, (axis, first) in zip(by_gain, offset, self.gain, strict=True):
             gain = 1.0 / (1.0 + (1.0 / first - 1.0) * self.xp.exp(-GAIN_REACH * row[axis]))

@@ -28,8 +28,7 @@ from .world import RadarWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported here, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 
@@ -168,7 +167,7 @@ class ManeuveringTarget(TargetProblem):
     )
 
     def set_up(self) -> None:
-        """Name the hypotheses, and set the paper's action."""
+        """Name the hypotheses, and set the paper's policy."""
         super().set_up()
         count = len(self.parameters.gains)
         self.flights: tuple[int, ...] = self.parameters.track_scans
@@ -177,7 +176,7 @@ class ManeuveringTarget(TargetProblem):
         self.closes_loop: bool = self.parameters.cluttered
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
-        """Return the filter's estimate, around which the radar returns plots, in clutter."""
+        """Return the filter's estimate, around which the radar returns plots in clutter."""
         return ReportedTrack(mean, covariance)
 
 

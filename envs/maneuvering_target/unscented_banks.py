@@ -1,7 +1,7 @@
 r"""Controls ``sigma-points`` and ``unscented``: the filter ``unscented-turn`` with settings that an action multiplies.
 
-Both are rivals of 2026, made from their abstracts without their code. At a scan that saw the target, with X_i the sigma
-points after the turn (i = 0 that of the mean, n = 5), W_i their weights and f the factors of the action,
+Both are rivals of 2026, made from their abstracts without their code. At a scan that saw the target, with X_i the
+sigma points after the turn (i = 0 that of the mean, n = 5), W_i their weights and f the factors of the action,
 
     sigma-points   x' = sum V_i X_i,  V_i = W_i f_i / sum W_j f_j,   P' = sum W_i^c f_i^c (X_i - x')(X_i - x')^T + Q
     unscented      alpha <- alpha f_1,   Q <- Q (f_2: acceleration, f_3: turn rate),   R <- R f_4
@@ -12,13 +12,12 @@ encoder compresses the history of innovations, and from it a policy network sets
 mean and covariance at each step; both are trained through the filter. Reading: the network sees the innovation under
 the plain weights, and its weights apply to the points of the same scan; they are factors of the plain ones, so that
 they stay positive and those for the mean sum to one. The mean's own point, of weight zero, has no factor for the mean.
-The update is Kalman's, because the measurement is linear.
 
 ``unscented`` is of O. Straka, F. Giraldo-Grueso and R. Zanetti, "Learning Adaptive Parameter Policies for Nonlinear
-Bayesian Filtering" (arXiv 2603.19910, 2026). The abstract states: a policy of reinforcement learning selects parameters
-of a filter's numerical approximation at each step, among them scaling parameters, with experiments on the unscented
-filter. That is f_1. The factors of the noises are ours: the measurement is linear here, and the scaling alone, at the
-ends of its range, changes the cost by less than a hundredth of a per cent.
+Bayesian Filtering" (arXiv 2603.19910, 2026). The abstract states: a policy of reinforcement learning selects
+parameters of a filter's numerical approximation at each step, among them scaling parameters, with experiments on the
+unscented filter. That is f_1. The factors of the noises are ours: the measurement is linear here, and the scaling
+alone, at the ends of its range, changes the cost by less than a hundredth of a per cent.
 
 Both limit the deviation of the turn rate, which factors of every scan could raise until nothing determines it.
 """
@@ -63,7 +62,7 @@ SPEED = 100.0
 
 
 class Prediction(NamedTuple):
-    """Prediction of the plain filter for a measurement."""
+    """Prediction of the unscented filter without an action, for a measurement."""
 
     innovation: Array
     """m, ``(2, N)``; zero where the scan missed the target."""
@@ -77,17 +76,17 @@ class Prediction(NamedTuple):
 
 
 class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measurement, EstimateState]):
-    """The unscented filter of the turn with settings that an action multiplies."""
+    """Base class of unscented filters of the turn with settings that an action multiplies."""
 
     def __init__(self, task: TargetProblem) -> None:
         super().__init__(task, **PLAIN_FILTER)
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where the scan saw the target."""
+        """Return 1 where the scan saw the target, else 0, ``(N,)``."""
         return measurement.available
 
     def examine(self, state: EstimateState, measurement: Measurement) -> Prediction:
-        """Return the prediction of the plain filter for a measurement, with the innovation and its likelihood."""
+        """Return the prediction without an action, with the innovation and its likelihood."""
         xp = self.xp
         mean, covariance = self.predict_turn(state.mean, state.covariance, measurement.interval)
         innovation = measurement.position - mean[:2]
@@ -97,7 +96,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
         return Prediction(measurement.available * innovation, prior, sensor, likelihood, mean)
 
     def limit(self, covariance: Array) -> Array:
-        """Limit the deviation of the turn rate: the measurements would no longer determine it."""
+        """Return the covariance with a limited deviation of the turn rate, so that scans still determine it."""
         xp = self.xp
         ratio = xp.minimum(LARGEST_DEVIATION / xp.sqrt(covariance[4, 4]), 1.0)
         factors = xp.stack([*([1.0 + 0.0 * ratio] * 4), ratio])
@@ -105,7 +104,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
 
 
 class WeightedUnscentedTurn(SteeredUnscentedTurn):
-    """The unscented filter whose weights of the sigma points an action multiplies."""
+    """Unscented filter of the turn: an action multiplies the weights of the sigma points."""
 
     settings: Mapping[str, float] = {
         **{f"mean_{side}{axis}": 5.0 for side in "+-" for axis in AXES},
@@ -113,7 +112,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
     }
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Weigh the propagated sigma points by the factors of the action, and update with the measured position."""
+        """Return the state: propagated sigma points weighted by the action's factors, updated with the position."""
         if inputs.action is None:
             return super().update(state, inputs)
         T, factors = inputs.measurement.interval, self.xp.exp(inputs.action)
@@ -128,7 +127,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
 
 
 class TunedUnscentedTurn(SteeredUnscentedTurn):
-    """The unscented filter whose scaling and noises an action multiplies."""
+    """Unscented filter of the turn: an action multiplies its scaling and noises."""
 
     settings: Mapping[str, float] = {
         "spread": 2.0**0.5,
@@ -138,7 +137,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
     }
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict with the scaling and noises multiplied by the action, and update with the measured position."""
+        """Return the state predicted with scaling and noises times the action's factors, and updated."""
         if inputs.action is None:
             return super().update(state, inputs)
         xp, measurement, T = self.xp, inputs.measurement, inputs.measurement.interval
@@ -155,7 +154,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
 
 
 class UnscentedState(NamedTuple):
-    """The filter at one moment."""
+    """State of a steered unscented filter, with the values that the agent observes."""
 
     own: EstimateState
     likelihood: Likelihood
@@ -176,11 +175,11 @@ class UnscentedState(NamedTuple):
 
 
 class UnscentedBank(SettingsBank, RadarBank):
-    """The unscented filter of the turn, steered by factors of its settings: common base of both controls."""
+    """Base class of the banks of one unscented filter of the turn, whose settings the action multiplies."""
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The innovation and its averages, how well it was predicted, and the predicted motion."""
+        """Observation blocks: innovation statistics, predicted deviation and motion, detection and times."""
         xp = self.xp
         return (
             innovation_block("xy"),
@@ -214,7 +213,7 @@ class UnscentedBank(SettingsBank, RadarBank):
         )
 
     def start(self, initial: Initial) -> UnscentedState:
-        """Return the bank's state at the initial estimate, with zero action."""
+        """Return the filter's state at the initial estimate, with zero action."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         action = self.xp.stack([none[0]] * len(self.own.settings))
         return UnscentedState(own, own.likelihood, action, none, none, own.mean, none[0], none, none[0])
@@ -222,7 +221,7 @@ class UnscentedBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: UnscentedState, found: Prediction, measurement: Measurement
     ) -> UnscentedState:
-        """Return the state with the innovation, its averages and the prediction, which the agent observes."""
+        """Return the state with innovation statistics and the prediction filled in."""
         xp = self.xp
         innovation = found.innovation / xp.sqrt(found.innovation_variance)
         squares = innovation * innovation
@@ -239,12 +238,12 @@ class UnscentedBank(SettingsBank, RadarBank):
 
 
 class SigmaPointsBank(UnscentedBank):
-    """Control ``sigma-points``: factors of the weights of the sigma points."""
+    """Bank of the control ``sigma-points``: the action multiplies the weights of the sigma points."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = WeightedUnscentedTurn
 
 
 class ScalingBank(UnscentedBank):
-    """Control ``unscented``: factors of the scaling and of the noises."""
+    """Bank of the control ``unscented``: the action multiplies the scaling and the noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = TunedUnscentedTurn

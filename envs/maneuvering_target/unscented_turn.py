@@ -12,10 +12,9 @@ DEGREE = math.pi / 180.0
 
 
 class TurnModel(ConstantVelocityModel):
-    """The nearly coordinated turn, with the turn rate as fifth state.
+    """Model of a nearly coordinated turn, with the turn rate as fifth state.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration along x and y, m/s^2.
         turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
     """
@@ -27,23 +26,22 @@ class TurnModel(ConstantVelocityModel):
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array, acceleration: float | Array = 1.0, turn_rate: float | Array = 1.0) -> Array:
-        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``, its variances multiplied."""
+        """Return the process noise covariance over intervals, s, ``(5, 5, N)``, with factors on its variances."""
         Q = (acceleration * self.variance) * self.motion(T)[1]
         change = turn_rate * (T * self.change) ** 2
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, change)[1]
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Return mean and covariance predicted by the extended Kalman filter of the turn over intervals, s."""
+        """Return the mean and covariance that an extended Kalman filter of the turn predicts over intervals, s."""
         return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
 class UnscentedTurn(TurnModel, KalmanModel):
-    """Unscented Kalman filter of position, velocity and turn rate, always in a nearly coordinated turn.
+    """Unscented Kalman filter of position, velocity and turn rate in a nearly coordinated turn.
 
     The measurement is linear, so only the prediction takes the unscented transform; the update is Kalman's.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration along x and y, m/s^2.
         turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
         turn_rate_start: standard deviation of the turn rate at the start of the track, degrees/s.
@@ -60,11 +58,11 @@ class UnscentedTurn(TurnModel, KalmanModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
-        """Return the state at the initial estimate, with a turn rate of mean zero."""
+        """Return the filter's state at the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Return mean and covariance of the sigma points after the turn over intervals, s, with process noise."""
+        """Return the mean and covariance of sigma points after a turn over intervals, s, with process noise."""
         mean, covariance = unscented.transform(
             mean, covariance, lambda points: coordinated_turn.propagate(points, T)
         )

@@ -36,7 +36,7 @@ class Truth(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """Motion since the previous scan by a second sensor: wheels and a compass, a camera, an INS."""
+    """Motion since the previous scan by a second sensor, such as wheels and a compass, a camera or an INS."""
 
     displacement: Array
     """Displacement along x and y, m, ``(2, N)``; zero without a reading."""
@@ -98,7 +98,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         self.row_uniforms: int = self.scans.row_uniforms + self.disturbances.row_uniforms
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Return the drawn truth of the flight, and the initial estimate with errors of a measurement's size (24)."""
+        """Draw flight, scans and disturbances; return this truth, and the initial estimate (24)."""
         xp, p = self.xp, self.parameters
         ones = xp.ones_like(normals[0])
         flight, (position, velocity) = self.course.begin(draws, ones)
@@ -111,7 +111,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
         states = self.disturbances.begin(draws, normals[4:], 0.0 * ones)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         truth = Truth(0.0 * ones, position, velocity, flight, scans, states)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 
@@ -142,7 +142,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
     def error_axes(self, position: Array) -> Array:
-        """Return the displacement of the measured position by errors of one standard deviation, ``(2, 2, N)``.
+        """Return the displacements of the measured position by errors of one standard deviation, ``(2, 2, N)``.
 
         To first order; the columns are errors along x and y or, where measurements are polar, of range and azimuth.
         """
@@ -157,9 +157,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def _measure(
         self, position: Array, errors: Array, states: dict[str, Any]
     ) -> tuple[dict[str, Any], Array]:
-        """Return the disturbances' states and the measured position, m, ``(2, N)``, from errors in standard deviations.
+        """Return the disturbances' states and the measured position, m, ``(2, N)``.
 
-        The radar reads range and azimuth, or x and y.
+        ``errors`` are in standard deviations of range and azimuth, or of x and y.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -208,7 +208,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return self.disturbances.records(truth.disturbances)
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context of course, scans and disturbances, by name."""
+        """Return the random draws of course, scans and disturbances, by name."""
         time = self.scans.time(truth.scans, truth.scan)
         return {
             **self.course.context(truth.flight, truth.scan, time),

@@ -79,12 +79,6 @@ class Filters(NamedTuple):
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
 def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
-    """Return the gains and innovation statistics of the classes' filters at every scan of an episode.
-
-    Args:
-        content: shape and numbers of the arrays of the models, and of the initial covariances.
-        scans: the last scan.
-    """
     *models, start = (numpy.frombuffer(numbers).reshape(shape) for shape, numbers in content)
     return class_fusion.design_channels(class_fusion.Models(*models), start, scans)
 
@@ -95,7 +89,7 @@ def bearing_gate(p: RadarEsmTrackingParameters) -> float:
 
 
 def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
-    """Return the observation blocks of the ESM's decision and of its bearing difference."""
+    """Return the observation blocks of the ESM's type decision and of its bearing difference."""
     none = task.types
     return (
         Block(
@@ -122,7 +116,7 @@ def clock_block(task: RadarEsmProblem) -> Block:
 
 
 class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
-    """Bank of ``evidence``, ``mode`` and ``weights``: a Kalman filter for each class, mixed if classes may change."""
+    """Bank of ``evidence``, ``mode`` and ``weights``: one Kalman filter for each class of target, weighted."""
 
     parameters: RadarEsmTrackingParameters
 
@@ -153,7 +147,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: each filter's innovations and likelihoods, ESM decisions, last weights, and the time."""
+        """Observation blocks, such as each filter's innovations and likelihoods, ESM decisions, last weights."""
         xp, p, classes = self.xp, self.parameters, self.task.modes
         none = self.task.types
         types = tuple(str(j) for j in range(none))
@@ -205,7 +199,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     # --- the clock
 
     def start(self, initial: Start) -> Filters:
-        """Return all filters started on the first radar measurement, and weighted by the first ESM decision."""
+        """Return the filters started on the first radar measurement, weighted by the first ESM decision."""
         xp = self.xp
         mean = xp.stack([initial.mean] * self.task.classes, axis=1)
         zeros = 0.0 * mean[:2]
@@ -233,7 +227,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Return the filters predicted by one scan and updated with the radar, with the ESM decision counted."""
+        """Return the filters predicted by one scan and updated with the radar, and the ESM decision counted."""
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
@@ -275,7 +269,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     def _count_decisions(
         self, used_counts: Array, refused_counts: Array, measurement: Measurement
     ) -> tuple[Array, Array, Array]:
-        """Return whether this scan's ESM decision is within the gate (6), and the updated counts of decisions."""
+        """Return whether this scan's ESM decision is within the gate (6), and the counts of decisions."""
         xp, decision = self.xp, measurement.decision
         decided = one_hot(decision, self.task.types, xp)
         used = (decision < self.task.types) & (xp.abs(measurement.bearing_difference) <= self.gate)
@@ -283,12 +277,12 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return used, used_counts + accepted, refused_counts + (decided - accepted)
 
     def _esm_log_likelihood(self, used: Array, measurement: Measurement) -> Array:
-        """Return the log-probability of an ESM decision in each class, ``(M, N)``; 0 outside the gate."""
+        """Return the log-probability of the ESM decision in each class, ``(M, N)``; 0 outside the gate."""
         usable = self.xp.where(used, measurement.decision, self.task.types)
         return self.xp.take(self.log_esm, usable, axis=1)
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Return the state with the class weights that follow from the action; evidence affects this scan only."""
+        """Return the state with the class weights that follow from the action; evidence counts in this scan only."""
         log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
         control, scale = self.control, self.parameters.evidence_scale
         probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
@@ -302,14 +296,14 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the weighted mean with the spread of the filters, equation (12), ``(3, 3, N)``."""
+        """Return the covariance of the weighted mean, with the spread of the filters (12), ``(3, 3, N)``."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: weights, NIS and log-likelihood of the radar measurement.
+        """Return weights, NIS and log-likelihood of the radar measurement to record at a scan, by name.
 
-        The NIS of the bank is the mean over the classes by their probability given the radar. If these are
-        calibrated, its expectation is 2, that of the true class's filter.
+        The NIS is the mean over the classes by their probability given the radar; if these are calibrated, its
+        expectation is 2.
         """
         squared = ordered_sum(state.innovation * state.innovation)
         nis = weighted_sum(imm.softmax(state.log_predicted), squared)

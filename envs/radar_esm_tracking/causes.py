@@ -36,11 +36,7 @@ def _has_second_emitter(moment: Moment) -> Array | None:
 
 
 def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
-    """Return the causes of costs of the task as one tuple, with one for each class.
-
-    Args:
-        classes: names of the classes.
-    """
+    """Return the causes of cost of the task as one tuple, among them one for each class of target."""
     return (
         *(
             Cause(f"class {name}", f"on targets of class {name}", _is_of_class(s))

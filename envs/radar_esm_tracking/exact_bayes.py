@@ -20,8 +20,7 @@ of the change is independent of the second emitter and the silences. Further app
 * The radar's coloured errors have one strength and one correlation time for all targets.
 * Each filter weights outliers separately, if the prior has any.
 
-This is the estimator ``exact-bayes`` of the baselines. The control ``hypotheses`` multiplies its settings by factors
-f at each scan. Before the radar update,
+The control ``hypotheses`` steers this estimator, ``exact-bayes``, by factors f at each scan. Before the radar update,
 
     P(s, h) <- P(s, h) f(s) f4^changed(h),    T(j, e) <- T(j, e) f5^disturbed(e)    normalised again by Bayes' rule
     Q <- f6 Q,    R <- f7 R
@@ -53,7 +52,7 @@ zero, and their ratios would be lost."""
 
 
 class ClassPrior(NamedTuple):
-    """Prior of the filter :class:`ExactBayes`; times in s."""
+    """Prior of the estimator :class:`ExactBayes`: classes, silences and second emitters; times in s."""
 
     change_rate: float = 0.0077
     """Expected number of changes of class per second."""
@@ -129,7 +128,7 @@ class ClassTracks(NamedTuple):
 
 
 class ClassState(NamedTuple):
-    """State of the filter :class:`ExactBayes`."""
+    """State of the estimator ``exact-bayes``: estimate, hypotheses of class and onset, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(3, N)``."""
@@ -140,11 +139,9 @@ class ClassState(NamedTuple):
 
 
 class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
-    """Bayes filter over classes, changes of class and emitters.
+    """Estimator ``exact-bayes``: Bayes' rule over classes of target, their changes, and emitters.
 
     Args:
-        task: the problem.
-        prior: the prior.
         changed: fields of the prior with other values.
     """
 
@@ -202,7 +199,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
 
     def start_tracks(self, initial: Start) -> ClassTracks:
-        """Return the hypotheses of class and onset at the start of the track."""
+        """Return the hypotheses of class and onset at the start, with T0 of the first ESM look."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
@@ -225,7 +222,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
     def class_likelihoods(self, table: Array, points: list[list[int]]) -> Array:
-        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over some grid points of each type."""
+        """Return sums over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over given grid points of each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
         types = [i for i, some in enumerate(points) if some]
@@ -243,7 +240,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
     def normalise(
         self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
     ) -> ClassTracks:
-        """Return the hypotheses with T0, T1 and probabilities normalised to sums of one."""
+        """Return the hypotheses with class probabilities weighted by T0, and T0, T1 and these normalised to one."""
         xp = self.xp
         total = ordered_sum(ordered_sum(ordered_sum(first)))
         first, unchanged = first / total, unchanged * total
@@ -268,9 +265,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def apply_factors(self, memory: ClassTracks, logarithms: Array) -> ClassTracks:
-        """Return the hypotheses with probabilities of classes, changes and second emitter multiplied by
-        ``exp(logarithms)``.
-        """
+        """Return the hypotheses with probabilities of classes, changes and second emitter times ``exp(logarithms)``."""
         xp, S = self.xp, self.classes
         classes, changed = xp.exp(logarithms[:S]), xp.exp(logarithms[S])
         second_emitter = xp.exp(self.disturbed * logarithms[S + 1])
@@ -290,10 +285,6 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
 
     def predict_motion(self, memory: ClassTracks, process: Array = 1.0) -> tuple[Array, Array]:
         """Return the means and covariances of all hypotheses predicted to the next scan.
-
-        Args:
-            memory: hypotheses after the previous scan.
-            process: factor on the covariance of the process noise, ``(N,)`` or a number.
 
         Returns:
             Means ``(n, S, M, N)`` and covariances ``(n, n, S, M, N)``.
@@ -336,7 +327,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, SMALLEST_PROBABILITY, None),
             changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], SMALLEST_PROBABILITY, None),
         )
-        moved = self.change(moved, measurement.scan)
+        moved = self.change_class(moved, measurement.scan)
         looked = measurement.looked
         first, later = (
             emitters.predict_silence(table, self.grid, looked) for table in (moved.first, moved.later)
@@ -358,8 +349,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             estimate, covariance = class_fusion.remove_coloured_errors(estimate, covariance)
         return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
-    def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
-        """Return the hypotheses after a possible change of class; it occurs at one scan of every ``spacing``."""
+    def change_class(self, m: ClassTracks, scan: Array) -> ClassTracks:
+        """Return the hypotheses after a possible change of class, at one scan of every ``spacing``."""
         xp, prior, B, others = self.xp, self.prior, self.prior.onsets, self.classes - 1
         p, S, n = self.parameters, range(self.classes), self.states
         seconds = p.sampling_interval * scan

@@ -33,7 +33,7 @@ LEAST = 1e-9
 
 
 class HypothesesState(NamedTuple):
-    """State of the filter ``exact-bayes`` with the values that the agent observes; S classes."""
+    """State of the estimator ``exact-bayes`` with the values that the agent observes; S classes."""
 
     own: ClassState
     """State of the estimator after the last action."""
@@ -63,7 +63,7 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank):
-    """Bank of ``hypotheses``: Bayes' rule over classes and emitters, with factors on probabilities and noises."""
+    """Bank of ``hypotheses``: estimator ``exact-bayes`` with factors on probabilities and noises."""
 
     filter_class = ExactBayes
     task: RadarEsmProblem
@@ -76,9 +76,7 @@ class HypothesesBank(SettingsBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovation, likelihood, probabilities of classes and second emitter, ESM, and the
-        time.
-        """
+        """Observation blocks, such as innovation, probabilities of classes and second emitter, ESM decisions."""
         xp, p = self.xp, self.parameters
         unit = math.log(2.0 * math.pi * p.range_sigma * p.range_rate_sigma)
         return (
@@ -127,12 +125,12 @@ class HypothesesBank(SettingsBank):
         )
 
     def group(self, weights: Array) -> Array:
-        """Return the probabilities of unchanged and of changed classes, ``(2 S, N)``, from hypotheses ``(S, M, N)``."""
+        """Return the probabilities of unchanged and changed classes, ``(2 S, N)``, from hypotheses ``(S, M, N)``."""
         changed = ordered_sum(weights[:, h] for h in range(1, weights.shape[1]))
         return self.xp.concat([weights[:, 0], changed])
 
     def class_estimates(self, own: ClassState) -> dict[str, Array]:
-        """Return the mean, ``(3, S, N)``, and the probability, ``(S, N)``, of each class, by name."""
+        """Return the mean, ``(3, S, N)``, and probability, ``(S, N)``, of each class, by name."""
         tracks, hypotheses = own.tracks, range(own.tracks.weights.shape[1])
         probabilities = ordered_sum(tracks.weights[:, h] for h in hypotheses)
         total = ordered_sum(tracks.weights[:, h] * tracks.mean[:3, :, h] for h in hypotheses)
@@ -144,7 +142,7 @@ class HypothesesBank(SettingsBank):
     def add_observed(
         self, state: HypothesesState, result: ClassState, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the joint innovation, and the probabilities before and after the scan, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the scan, filled in."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
         size = tracks.weights.shape[0] * tracks.weights.shape[1]
         mean, P = bank.predict_motion(tracks)
@@ -173,10 +171,10 @@ class HypothesesBank(SettingsBank):
         )
 
     def act(self, state: HypothesesState, measurement: Measurement, action: Array) -> HypothesesState:
-        """Return the state updated by the filter with its settings multiplied by the factors of the action."""
+        """Return the state updated with the estimator's settings multiplied by the action's factors."""
         after = super().act(state, measurement, action)
         return after._replace(**self.class_estimates(after.own))
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: class probabilities, likelihood of the radar measurement."""
+        """Return class probabilities, and likelihood and NIS of the radar measurement, to record, by name."""
         return {"mode_probability": state.probabilities, **state.likelihood._asdict()}

@@ -2,17 +2,16 @@ r"""The learned estimator ``kalman-net`` of RadarEsmTracking: a recurrent networ
 
 This is the paper's algorithm with two covariances for the Kalman filter of each class: P of the errors, and M, from
 which the gain is computed. At every scan the network returns numbers in [-1, 1]: evidence of every class as under
-control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, then b_0 and b_i
-like them. They are the same for all classes:
+control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, then b_0 and b_i like
+them. They are the same for all classes:
 
     noise    Q(s) = noise_range^(2 a_0) Q(s),  R_i = noise_range^(2 a_i) R_i,  P' = Phi P Phi^T + Q(s)
     gain     M' = Phi M Phi^T + caution^(2 b_0) Q(s),  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K Delta,  P = (I - K H) P' (I - K H)^T + K R K^T                              (Joseph form)
 
-The likelihoods of the classes use P' and R of the previous scan's output. All zero is the paper's algorithm. M follows
-the Riccati equation of noises between limits, so that the filters are stable for any output. References and reading are
-in ``maneuvering_target/kalman_net.py``.
+The likelihoods of the classes use P' and R of the previous scan's output. All zero is the paper's algorithm.
+References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
@@ -43,9 +42,7 @@ NOISES = ("acceleration", "range", "range_rate")
 
 
 class NetFilters(NamedTuple):
-    """State of the bank: :class:`~.banks.Filters` with packed covariances, the gain's covariance and the last
-    output.
-    """
+    """State of the bank: :class:`~.banks.Filters`, covariances packed, the gain's covariance, the last output."""
 
     mean: Array
     """Means, ``(3, M, N)``; between :meth:`KalmanNetBank.predict` and the action predicted."""
@@ -71,7 +68,7 @@ class NetFilters(NamedTuple):
 
 
 class KalmanNetBank(ClassBank):
-    """Bank of ``kalman-net``: the paper's filters, whose noises, gains and weights the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises, gains and weights of the filters."""
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
@@ -94,9 +91,7 @@ class KalmanNetBank(ClassBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: those of :class:`ClassBank`, the predicted deviation of the range, and the last
-        output.
-        """
+        """Observation blocks: those of :class:`ClassBank`, the range's predicted deviation, the last output."""
         unit, place = 1.0 / self.radar_variances[0], packed_covariance.position(3, 0, 0)
         return (
             *super().blocks,
@@ -111,22 +106,20 @@ class KalmanNetBank(ClassBank):
         )
 
     def start(self, initial: Start) -> Any:
-        """Return the paper's algorithm at the start of the track, as :class:`NetFilters`."""
+        """Return the filters of the paper at the start of the track, as :class:`NetFilters`."""
         fields = super().start(initial)._asdict()
         fields["covariance"] = covariance = packed_covariance.pack(fields["covariance"])
         action = self.xp.stack([0.0 * initial.mean[0]] * len(self.action_names))
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:
-        """Return the factor on the process noise, and the variances of range and range rate under an action, ``(N,)``
-        each.
-        """
+        """Return the process noise factor, and the variances of range and range rate under an action, ``(N,)`` each."""
         classes = self.task.classes
         scale = self.xp.exp(2.0 * math.log(NOISE_RANGE) * action[classes : classes + len(NOISES)])
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
-        """Return the filters predicted by one scan, with the innovation statistics of the radar measurement."""
+        """Return the filters predicted by one scan, with innovation statistics of the radar measurement."""
         xp, f = self.xp, state
         mean = apply(self.task.models.Phi[..., None], f.mean)
         covariance = apply(self.propagator, f.covariance)
@@ -159,7 +152,7 @@ class KalmanNetBank(ClassBank):
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Return the filters updated with the action's gains, after the class transition, and weighted."""
+        """Return the filters updated with the action's gains and weighted, after the class transition."""
         xp, classes, f = self.xp, self.task.classes, state
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         process, radar = self.noises(a)
@@ -201,6 +194,6 @@ class KalmanNetBank(ClassBank):
         )
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the weighted mean with the spread of the filters, equation (12), ``(3, 3, N)``."""
+        """Return the covariance of the weighted mean, with the spread of the filters (12), ``(3, 3, N)``."""
         each = packed_covariance.unpack(state.covariance, 3)
         return imm.combine(state.mean, each, state.probabilities)[1]

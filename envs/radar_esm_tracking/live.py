@@ -12,7 +12,7 @@ from .world import Measurement, Start
 
 
 class ScanInput(LiveInput):
-    """Converter of range and range rate at every scan, and of ESM decisions, into measurements.
+    """Converter of live range and range rate, and of ESM decisions, into measurements.
 
     The first scan starts the track: :meth:`start` takes it in place of mean and covariance.
     """

@@ -38,7 +38,7 @@ COLUMNS = {
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Return the measurements of one track from the columns of a table.
+    """Return the radar and ESM measurements of one track from the columns of a table.
 
     Raises:
         ValueError: if a column is missing or a value is not possible.
@@ -67,12 +67,7 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, p: Any) -> TrackStart:
-    """Return the start of every episode, on its first measurement.
-
-    Args:
-        measurements: ``(E, T, ...)``.
-        seconds: ``(E, T)``.
-        p: parameters.
+    """Return the start of every episode of a log, on its first measurement.
 
     Raises:
         ValueError: if there is no second measurement.
@@ -92,7 +87,7 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
 
 
 def _start_variances(p: Any) -> list[float]:
-    """Return the initial variances of range, range rate and acceleration, the last one of an unknown class (12)."""
+    """Return the initial variances of range, range rate and acceleration, the last for an unknown class (12)."""
     acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
     return [p.range_sigma**2, p.range_rate_sigma**2, acceleration]
 
@@ -103,7 +98,7 @@ def _numbers(p: Any) -> dict[str, float]:
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a measurement, except ``scan`` and ``radar``, from radar and ESM reports, by name.
+    """Return the arrays of a measurement by name, without ``scan`` and ``radar``, from radar and ESM reports.
 
     Args:
         readings: n rows of a table, or live values.

@@ -18,7 +18,7 @@ STANDARD_GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class RadarEsmTrackingParameters(TaskParameters):
-    """Constants of the task; each is a keyword of ``gym.make``."""
+    """Constants of RadarEsmTracking; each is a keyword of ``gym.make``."""
 
     sampling_interval: float = parameter(0.5, above=0.0, at_most=86400.0)
     """Radar revisit time T, s (paper)."""
@@ -131,7 +131,7 @@ class RadarEsmTrackingParameters(TaskParameters):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names of the target classes, S0, S1 and so on."""
+        """Names of the classes of target: S0, S1 and so on."""
         return tuple(f"S{s}" for s in range(len(self.manoeuvrability)))
 
     def check(self) -> None:

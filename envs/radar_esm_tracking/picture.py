@@ -38,7 +38,7 @@ CLASS_ROW = -1.0
 
 
 class RadarEsmTrackingPicture(Picture):
-    """Picture of the acceleration by truth, filters and estimate, ESM decisions, probabilities and errors."""
+    """Picture of acceleration (truth, filters, estimate), ESM decisions, class probabilities and errors."""
 
     clock = "scan"
     strips_left: float = 0.56
@@ -54,7 +54,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the values drawn at this scan by name: accelerations, weights, true class and type, decision."""
+        """Return the values that the picture shows at a scan by name, such as accelerations and weights."""
         filters, truth, decision = state.filter, state.truth, state.measurement.decision[0]
         decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
@@ -70,7 +70,7 @@ class RadarEsmTrackingPicture(Picture):
         }
 
     def begin(self, state: Episode) -> None:
-        """Store the time of the episode's class change and the scale of its accelerations."""
+        """Store the time of the episode's class change, and the scale of its accelerations."""
         truth, p = state.truth, self.task.parameters
         change = int(truth.change_scan[0])
         classes = [int(truth.target_class[0])]
@@ -84,7 +84,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series of the weights and of the three errors."""
+        """Return the time series of the picture: the weights and the three errors."""
         weights = {mode: f"weight.{s}" for s, mode in enumerate(self.task.modes)}
         limits = {"range": 2000.0, "range_rate": 30.0, "acceleration": 20.0}
         return [
@@ -100,11 +100,11 @@ class RadarEsmTrackingPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return False: the time series show the filters' quantities instead of the observation."""
+        """Return False: the picture shows the filters' quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the interval of scans after the change of class, which is shaded."""
+        """Return the scans after the change of class, which the picture shades."""
         return [] if self.change is None else [(self.change, self.task.horizon + 0.5)]
 
     # --- panels

@@ -9,12 +9,12 @@ from .parameters import RadarEsmTrackingParameters
 
 
 class RadarEsmProblem(Task):
-    """Base class of the task: classes and emitter types, and the motion and measurement models of each class."""
+    """Base class of the task: classes and emitter types, and the models of each class."""
 
     parameters: RadarEsmTrackingParameters
 
     def set_up(self) -> None:
-        """Count classes and types, and compute the motion and measurement models of the classes."""
+        """Count classes and emitter types, and compute the motion and measurement models of the classes."""
         p = self.parameters
         self.classes: int = len(p.manoeuvrability)
         self.types: int = len(p.recognition)
@@ -23,7 +23,7 @@ class RadarEsmProblem(Task):
 
     @staticmethod
     def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:
-        """Return the motion and measurement models of the classes and the initial covariances, ``(3, 3, M)``."""
+        """Return the motion and measurement models of the classes, and initial covariances, ``(3, 3, M)``."""
         T = p.sampling_interval
         Q = []
         for alpha, sigma in zip(p.manoeuvrability, p.acceleration_sigma, strict=True):

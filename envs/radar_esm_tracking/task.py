@@ -26,14 +26,12 @@ from .world import RadarEsmWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported here, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the reported variances, and the weight of the true class if there are weights, by name."""
     task: Any = model.task
     covariance = model.covariance(episode)
     own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(task.components)}
@@ -175,7 +173,7 @@ class RadarEsmTracking(RadarEsmProblem):
     )
 
     def set_up(self) -> None:
-        """Set the names of the classes, the paper's action and the causes of costs."""
+        """Set the names of the classes, the paper's policy and the causes of cost."""
         super().set_up()
         self.modes = self.parameters.class_names
         self.companions = (Causes(causes_of(self.modes)), *type(self).companions)

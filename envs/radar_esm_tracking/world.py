@@ -19,7 +19,7 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (Glint,)
 
 
 class Truth(NamedTuple):
-    """The true state of the target, its emitters and the radar errors."""
+    """True state of the target, of its emitters and of the radar errors."""
 
     scan: Array
     """Number of the current scan, integer, ``(N,)``; 0 starts the track."""
@@ -81,7 +81,7 @@ class Measurement(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The initial estimate given to every filter."""
+    """Initial estimate given to every filter, with the first measurement."""
 
     mean: Array
     """First measured range (m) and range rate (m/s), acceleration 0, ``(3, N)``."""
@@ -133,7 +133,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- the target and its emissions
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Return the drawn truth (target, class, disturbances) and the initial estimate from scan 0."""
+        """Draw target, class and disturbances; return this truth, and the initial estimate from scan 0."""
         xp, p, own = self.xp, self.parameters, self.own_initial_normals
         distance = draws.uniform("initial_range", p.initial_range)
         closing_speed = draws.uniform("closing_speed", p.closing_speed)
@@ -187,7 +187,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
             radar_kick=wandering.kick,
             radar_correlation=correlation,
             radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[own - 2 : own],
-            disturbances=self.disturbances.complete(
+            disturbances=self.disturbances.draw_further(
                 self.disturbances.begin(draws, normals[own:], zero), draws
             ),
         )
@@ -199,7 +199,6 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
-        """Return a drawn index of another class than the given one, all equally probable, ``(N,)``."""
         step = draws.integer(name, (1, self.task.classes - 1))
         return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
 
@@ -254,11 +253,8 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     ) -> tuple[Truth, Measurement]:
         """Return the truth and the measurement of radar and ESM at this scan.
 
-        Args:
-            truth: truth at this scan.
-            errors: normal numbers for the radar's white errors of range and range rate, ``(2, N)``.
-            bearings: normal numbers for the bearings of radar and ESM, ``(2, N)``.
-            uniforms: uniform numbers for the type, the decision and the source, ``(3, N)``.
+        ``errors`` and ``bearings`` are normal numbers for the radar's white errors and both bearings, ``(2, N)`` each;
+        ``uniforms`` are for the type, the decision and the source, ``(3, N)``.
         """
         xp, p = self.xp, self.parameters
         if p.radar_correlation != (0.0, 0.0):
@@ -297,7 +293,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- costs and readings
 
     def error_factor(self, truth: Truth) -> Array:
-        """Return the ratio of this scan's white radar errors to nominal ones, ``(N,)``; 1 without glint."""
+        """Return the standard deviation of this scan's white radar errors over nominal, ``(N,)``; 1 without glint."""
         return truth.disturbances.get("glint", self.xp.ones_like(truth.separation))
 
     def state(self, truth: Truth) -> Array:
@@ -325,12 +321,12 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
 
     def error_cost(self, error: Array) -> Array:
-        """Return the mean of the three squared errors over their scales, ``(N,)``."""
+        """Return the mean of the three squared errors over their squared scales, ``(N,)``."""
         scaled = error * self.cost_factors
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the values to record at a scan, by name: true class and type, and the time."""
+        """Return true class, true type, time and values of disturbances to record at a scan, by name."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -340,7 +336,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context by name: class and type, their change, second emitter, radar errors and silence."""
+        """Return the draws of classes, emitters, radar errors and silences, and their current values, by name."""
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
         changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)
@@ -367,5 +363,5 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
 
 
 def _thresholds(rows: object) -> numpy.ndarray:
-    """Return cumulative probabilities of rows as thresholds of a uniform number, ``(columns - 1, rows)``."""
+    """Return cumulative probabilities of rows as thresholds for a uniform number, ``(columns - 1, rows)``."""
     return numpy.cumsum(numpy.array(rows), axis=1)[:, :-1].T

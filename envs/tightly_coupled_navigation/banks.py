@@ -45,7 +45,7 @@ LEAST_STRENGTH = 1e-9
 
 
 class Prediction(NamedTuple):
-    """Prediction of the bank for a measurement, steps 1 to 4; M = 3 hypotheses."""
+    """Prediction of the bank for a measurement, steps 1 to 4, under M = 3 hypotheses."""
 
     mean: Array
     """Predicted means, ``(17, M, N)``."""
@@ -56,10 +56,10 @@ class Prediction(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """State of the bank.
+    """State of the bank of extended Kalman filters.
 
-    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step computes only one half
-    of them. The covariance of the combination (step 8) is computed on demand.
+    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`); that of the combination (step 8) is computed
+    on demand.
     """
 
     means: Array
@@ -92,7 +92,7 @@ class Filters(NamedTuple):
 
 
 class SatelliteBank(Bank[Task, Measurement, Any]):
-    """Base class of all banks: statistics of each filter by group of sensors, and the observation blocks of them."""
+    """Base class of the banks on satellite readings: statistics by group of sensors, and their observation blocks."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -107,7 +107,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: statistics of each filter by group of sensors, readings, availability, and the time."""
+        """Observation blocks, such as the NIS of each filter by group of sensors, innovations, availability, time."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in self.hypotheses]
@@ -187,7 +187,7 @@ class HypothesisBank(SatelliteBank):
         return bank_action_space(self.control, len(self.hypotheses))
 
     def start(self, initial: Initial) -> Filters:
-        """Return the bank's state at the start of the track, with the initial probabilities."""
+        """Return the filters' state at the start of the track, with the initial probabilities."""
         xp, M, task = self.xp, len(self.hypotheses), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
@@ -211,7 +211,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Return steps 1 to 4: mix the filters with their weights, and extrapolate each under its hypothesis."""
+        """Return the filters mixed with their weights and extrapolated under their hypotheses (steps 1 to 4)."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = imm.mix(state.means, unpack(state.covariances, gnss_ins.SIZE), chain.mixing)
@@ -227,7 +227,7 @@ class HypothesisBank(SatelliteBank):
         return weighted_sum(chain.probabilities, mean)
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Return the filters predicted to a measurement and updated with the nominal noise, with NIS and likelihood."""
+        """Return the filters predicted to a measurement and updated with nominal noise, with NIS and likelihood."""
         xp, task, predicted = self.xp, self.task, self._predict_hypotheses(state)
         combined = weighted_sum(predicted.probabilities, predicted.mean)
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
@@ -273,7 +273,6 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Return steps 5 and 6: every filter updated with the readings."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -294,7 +293,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
-        """Return the threshold of the robust update for each reading; None for the paper's update."""
+        """Return each reading's threshold of the robust update; None, as here, for the paper's update."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -321,7 +320,6 @@ class HypothesisBank(SatelliteBank):
         return self._combine(state, probabilities, last_action)
 
     def _combine(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
-        """Return the state with these weights and the combined mean (step 8)."""
         return state._replace(
             probabilities=probabilities,
             mean=weighted_sum(probabilities, state.means),
@@ -334,10 +332,9 @@ class HypothesisBank(SatelliteBank):
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: probabilities, NIS, log-likelihood, aperture.
+        """Return probabilities, NIS, log-likelihood, and whether a rate is outside its aperture, to record, by name.
 
-        They are the probabilities, the NIS of the combination with its degrees of freedom, the log-density of the
-        measurement under the prediction, and whether a rate is outside its aperture.
+        NIS and its degrees of freedom are those of the combination.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
@@ -351,7 +348,7 @@ class HypothesisBank(SatelliteBank):
 
 
 class NoiseBank(HypothesisBank):
-    """Bank of ``gain``: the action scales the sensors' noise; the hypotheses have the paper's probabilities."""
+    """Bank of ``gain``: the action scales the sensors' noise; Bayes' rule weights the hypotheses."""
 
     adapts_covariance = True
 
@@ -368,10 +365,7 @@ class NoiseBank(HypothesisBank):
     def _before_the_action(
         self, predicted: Prediction, update: extended_kalman.Correction
     ) -> tuple[Array, Array]:
-        """Return the predicted means and covariances, since the update waits for the action's noise.
-
-        A compiled step does not compute the unused update with the nominal noise.
-        """
+        """Return the predicted means and covariances, since the update waits for the action's noise."""
         return predicted.mean, predicted.covariance
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -386,7 +380,6 @@ class NoiseBank(HypothesisBank):
         return self.weigh_by_bayes(state, exponent)
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """Return the noise variance of every reading under an action, ``(N,)`` each."""
         xp, p, task = self.xp, self.parameters, self.task
         up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
         factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
@@ -397,14 +390,12 @@ class NoiseBank(HypothesisBank):
         ]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array] | None:
-        """Return the thresholds of the robust update of every reading, ``(N,)`` each; None for the plain update."""
         return None
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the combined mean, ``(17, 17, N)``; under an action inflated by the average NIS.
+        """Return the covariance of the combined mean, ``(17, 17, N)``, under an action inflated by the average NIS.
 
-        The factor is the short average of the NIS per reading, if that is above one: only the innovations indicate
-        whether the action's noise is right. With action zero it is the covariance of the paper's bank.
+        The factor is the short average of the NIS per reading, if above one; with action zero it is one.
         """
         groups = int(state.average_nis.shape[0])
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
@@ -413,15 +404,14 @@ class NoiseBank(HypothesisBank):
 
 
 class RobustBank(NoiseBank):
-    """Bank of ``robust``: noise as under ``gain``, and the treatment of repeated readings and outliers.
+    """Bank of ``robust``: the action scales the sensors' noise, and sets the treatment of repeats and outliers.
 
-    Whether a reading repeats or is an outlier is known only with the measurement, between two decisions; so the action
-    sets the treatment in advance.
+    The action sets the treatment in advance, since repeats and outliers are known only with the measurement.
     """
 
     @property
     def reach(self) -> float:
-        """Share of the logarithm of the noises' range that an action of one applies."""
+        """Share of the range of the noise factors, in logarithms, that actions within [-1, 1] use."""
         return self.parameters.noise_reach
 
     @property
@@ -440,7 +430,7 @@ class RobustBank(NoiseBank):
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array]:
-        """Return the Huber thresholds of every reading: finite for an action above 0, infinite for 0 or less."""
+        """Return the Huber threshold of each reading: finite for an action above 0, else infinite."""
         sensors = self.task.sensors
         strength = self.xp.clip(exponent[len(sensors) + 1 :], LEAST_STRENGTH, None)
         none = math.inf + 0.0 * exponent[0]

@@ -1,9 +1,8 @@
 """Motion of the user of TightlyCoupledNavigation: random legs for every episode, or the fixed legs of the paper.
 
-Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so no jump
-is left for step 2000. The truth was probably a sequence of states with V incremented and A = 0:
-``course="increment"``. Physically that is an accelerometer stuck at zero through leg 2. The consistent
-alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="kinematic"``.
+Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so no jump is left
+for step 2000. The truth was probably a sequence of states with V incremented and A = 0: ``course="increment"``. In the
+consistent alternative, ``course="kinematic"``, A = 30 m/s^2 in leg 2 and turns by 90 degrees.
 """
 
 import math
@@ -19,7 +18,7 @@ from .problem import NavigationProblem
 
 
 class Legs(NamedTuple):
-    """The L legs of a course."""
+    """Legs of a course: first steps, kinds and initial accelerations; L legs."""
 
     start: Array
     """Last step before each leg, ``(L, N)``."""
@@ -30,11 +29,7 @@ class Legs(NamedTuple):
 
 
 class Course:
-    """Motion along legs of rest, straight flight and manoeuvre.
-
-    Args:
-        task: the problem, with parameters and models.
-    """
+    """Simulation of motion along legs of rest, straight flight and manoeuvre."""
 
     def __init__(self, task: NavigationProblem) -> None:
         self.task = task
@@ -43,21 +38,16 @@ class Course:
         self.singer_root: Array = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
 
     def begin(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return the drawn legs of each episode, the initial velocity and the heading.
-
-        Args:
-            draws: of the episode.
-            zeros: ``(N,)``.
+        """Draw the legs of each episode, the initial velocity and the heading.
 
         Returns:
-            The legs, the velocity at the start, ``(3, N)``, m/s, and the heading of the level aircraft, ``(N,)``, rad.
+            The legs, the velocity, ``(3, N)``, m/s, and the heading of the level aircraft, ``(N,)``, rad.
         """
         if self.parameters.course == "random":
             return self._random_legs(draws, zeros)
         return self._fixed_legs(draws, zeros)
 
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return the legs, initial velocity and heading of the paper's experiment, or of the matched course."""
         xp, p = self.xp, self.parameters
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
         draws.unit("legs", 15)
@@ -79,7 +69,6 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return random legs of rest, straight flight and manoeuvre, the initial velocity and heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None
@@ -119,7 +108,7 @@ class Course:
         return legs, velocity, heading
 
     def leg_at(self, legs: Legs, k: Array) -> tuple[Array, Array]:
-        """Return the kind, ``(N,)``, and the initial acceleration, ``(3, N)``, of the leg to which step k belongs."""
+        """Return the kind, ``(N,)``, and the initial acceleration, ``(3, N)``, of the leg that contains step k."""
         kind, push = legs.kind[0], legs.acceleration[:, 0]
         for i in range(1, legs.start.shape[0]):
             begun = k > legs.start[i]
@@ -128,18 +117,18 @@ class Course:
         return kind, push
 
     def move(self, legs: Legs, k: Array, state: Array, moved: Array, w: Array) -> tuple[Any, Array, Array]:
-        """Return position, velocity and acceleration after step k, the hypothesis it follows, and whether it jumps.
+        """Return position, velocity and acceleration after step k, the hypothesis followed, and whether it jumps.
 
         Args:
-            legs: of the episode.
+            legs: those of the episode.
             k: number of the step, ``(N,)``.
-            state: before it, ``(17, N)``.
+            state: state before it, ``(17, N)``.
             moved: the same as Singer's model extrapolates it.
             w: standard normal numbers, ``(3, 3, N)``.
 
         Returns:
-            Position, velocity and acceleration, ``(3, N)`` each; the hypothesis that the step follows, ``(N,)``
-            integers; and one where the acceleration has jumped, ``(N,)``.
+            Position, velocity and acceleration, ``(3, N)`` each; the hypothesis, ``(N,)`` integers; and 1
+            where the acceleration has jumped, ``(N,)``.
         """
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         kind, push = self.leg_at(legs, k)

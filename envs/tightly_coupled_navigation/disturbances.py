@@ -53,7 +53,7 @@ def _is_pulled(moment: Moment) -> Array | None:
 
 
 class _OfSatellites(Disturbance):
-    """Base class of disturbances of S satellites; the readings begin with pseudoranges, then their rates."""
+    """Base class of disturbances of S satellites, whose readings are pseudoranges, then their rates."""
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
@@ -62,18 +62,17 @@ class _OfSatellites(Disturbance):
         self.places: Array = task.constant(range(task.satellites))[:, None]
 
     def change_rows(self, values: Array, first: int, changed: Array) -> Array:
-        """Return the values of all readings, ``(m, N)``, with those of ``changed`` put in from row ``first`` on."""
+        """Return the values of all readings, ``(m, N)``, with ``changed`` from row ``first`` on."""
         return self.xp.concat([values[:first], changed, values[first + changed.shape[0] :]])
 
     def change_available(self, measurement: Any, first: int, factor: Array) -> Any:
-        """Return the measurement with the availability of readings from ``first`` on multiplied by ``factor``."""
         available = measurement.available
         changed = available[first : first + factor.shape[0]] * factor
         return measurement._replace(available=self.change_rows(available, first, changed))
 
 
 class Fault(NamedTuple):
-    """State of a temporary disturbance that occurs at most once in an episode."""
+    """State of a temporary sensor disturbance: its window, satellites, strength, whether it occurs now."""
 
     window: Array
     """First and last step of the disturbance, ``(2, N)``; -1 where it does not occur."""
@@ -92,7 +91,7 @@ class _Once(_OfSatellites):
     """Prefix of the parameters of its probability and duration."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Return the drawn state: first and last step of the disturbance, if it occurs, and its satellites.
+        """Draw the first and last step of the disturbance, if it occurs, and its satellites.
 
         The start is uniform over the times that leave room for the duration.
         """
@@ -105,11 +104,9 @@ class _Once(_OfSatellites):
         return Fault(xp.where(happens, window, -1.0), self.draw_satellites(draws), zero, zero)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Return the drawn indices of the affected satellites, ``(n, N)``; by default None."""
         return None
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Return the disturbance's state with ``now`` set: whether it occurs at this step."""
         happens = (step.number >= state.window[0]) & (step.number <= state.window[1])
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
 
@@ -121,7 +118,6 @@ class _Once(_OfSatellites):
         return chosen & (state.now > 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the context: first and last step of the disturbance (-1 where it does not occur), by name."""
         window = state.window
         return {self.name: self.xp.where(window[1] >= window[0], window, -1.0)}
 
@@ -130,22 +126,24 @@ class _Hidden(_Once):
     """Temporary disturbance that the measurement does not report."""
 
     def switch_off(self, state: Fault, undisturbed: Array) -> Fault:
-        """Return the state without the disturbance in the episodes where ``undisturbed``."""
         return state._replace(window=self.xp.where(undisturbed, -1.0, state.window))
 
 
 class StuckAccelerometers(_Hidden):
-    """Accelerometers that repeat their last reading; that is the further state, m/s^2, ``(3, N)``."""
+    """Disturbance by accelerometers that repeat their last reading for a time; unreported.
+
+    The further state is the last reading, m/s^2, ``(3, N)``.
+    """
 
     name, title = "stuck", "stick"
     causes = (Cause("stuck accelerometers", "while the accelerometers are stuck", context_flag("stuck_now")),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Return the drawn state: whether and when the accelerometers stick, with zero as the last reading."""
+        """Draw whether and when the accelerometers stick; the last reading is zero."""
         return super().begin(draws, normals, zero)._replace(own=self.xp.stack([zero] * 3))
 
     def change_reading(self, state: Fault, reading: Array) -> tuple[Fault, Array]:
-        """Return the state with the last reading, and the readings with it repeated while accelerometers stick."""
+        """Return the state with the last reading, and the readings, in which stuck accelerometers repeat it."""
         rows = self.task.sensors[2].readings
         forces = self.xp.where(state.now > 0.0, state.own, reading[rows])
         return state._replace(own=forces), self.change_rows(reading, rows.start, forces)
@@ -156,80 +154,83 @@ class StuckAccelerometers(_Hidden):
         return state._replace(now=self.xp.where(step.number > 1.0, state.now, 0.0))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the context: window of the fault, and whether the accelerometers stick now, by name."""
+        """Return the window of the fault, and whether the accelerometers stick now, by name."""
         return {**super().context(state), "stuck_now": state.now}
 
 
 class NoisyRate(_Hidden):
-    """Noisy rate channel of one satellite, by a factor on its standard deviation, the further state, ``(N,)``."""
+    """Disturbance by a noisier rate channel of one satellite for a time; unreported.
+
+    The further state is the factor on its standard deviation, ``(N,)``.
+    """
 
     name, title = "noisy", "rate_fault"
     causes = (Cause("noisy rate", "while a pseudorange rate is too noisy", _is_noisy),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Return the drawn index of the satellite with a noisy rate, ``(1, N)``."""
+        """Draw the index of the satellite with a noisy rate, ``(1, N)``."""
         return draws.integer("noisy_satellite", (0, self.satellites - 1))[None]
 
-    def complete(self, state: Fault, draws: Draws) -> Fault:
+    def draw_further(self, state: Fault, draws: Draws) -> Fault:
         """Return the state with the drawn factor on the standard deviation of the satellite's rate."""
         factor = draw_between(draws.log_uniform, "rate_fault_factor", self.parameters.rate_fault_factor)
         return state._replace(own=state.own + factor)
 
     def change_deviations(self, state: Fault, deviations: Array) -> Array:
-        """Return the deviations with that of the satellite's rate multiplied by the factor."""
+        """Return the standard deviations, with that of the satellite's rate times its factor."""
         S = self.satellites
         factor = self.xp.where(self.is_at(state), state.own, 1.0)
         return self.change_rows(deviations, S, factor * deviations[S : 2 * S])
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the context: window and satellite of the noisy rate, by name."""
+        """Return the window and satellite of the noisy rate, by name."""
         return {**super().context(state), "noisy_satellite": state.satellites[0]}
 
 
 class HiddenSatellites(_Once):
-    """Outage of two satellites."""
+    """Disturbance by an outage of two satellites for a time."""
 
     name, title = "hidden", "satellites_outage"
     causes = (Cause("range lost", "where a pseudorange is missing", _lacks_range),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Return the drawn indices of the two hidden satellites, ``(2, N)``."""
+        """Draw the indices of the two hidden satellites, ``(2, N)``."""
         S = self.satellites
         first = draws.integer("hidden_satellite", (0, S - 1))
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return self.xp.stack([first, second])
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Return the state, and the measurement with both satellites' pseudoranges and rates missing."""
+        """Return the state, and the measurement without both satellites' pseudoranges and rates."""
         seen = self.xp.where(self.is_at(state), 0.0, self.xp.ones_like(state.now))
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the context: window and satellites of the outage, by name."""
+        """Return the window and satellites of the outage, by name."""
         return {**super().context(state), "hidden_satellites": state.satellites}
 
 
 class LostRates(_Once):
-    """Outage of all rates."""
+    """Disturbance by an outage of all rates for a time."""
 
     name, title = "no_rates", "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Return the state, and the measurement with the rates of all satellites missing."""
+        """Return the state, and the measurement without the rates of all satellites."""
         kept = self.xp.stack([1.0 - state.now] * self.satellites)
         return state, self.change_available(measurement, self.satellites, kept)
 
 
 class RangeColour(ColouredErrors):
-    """Pseudorange errors that are correlated in time: diffuse multipath, atmosphere, ephemerides."""
+    """Disturbance by pseudorange errors that are correlated in time, such as of the atmosphere."""
 
     def __init__(self, task: NavigationProblem) -> None:
         p = task.parameters
         super().__init__(task, p.sampling_interval, task.satellites, p.pseudorange_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Return the drawn standard deviation, m, and correlation time, s, of pseudorange errors, ``(N,)`` each."""
+        """Draw the standard deviation, m, and correlation time, s, of pseudorange errors, ``(N,)`` each."""
         p = self.parameters
         draw_undisturbed(draws, p)  # comes first among the random numbers
         if not self.normals:
@@ -245,12 +246,12 @@ class RangeColour(ColouredErrors):
         return errors + state.level
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the context: standard deviation, m, and decay of the pseudorange errors, by name."""
+        """Return standard deviation, m, and decay of the pseudorange errors, by name."""
         return {"coloured_deviation": state.deviation, "coloured_decay": state.process.decay}
 
 
 class Reception(NamedTuple):
-    """State of :class:`Reflections`."""
+    """State of the reception between houses: C/N0, multipath errors and their durations."""
 
     urban: Array
     """One for reception between houses, else zero, ``(N,)``."""
@@ -263,7 +264,7 @@ class Reception(NamedTuple):
 
 
 class Reflections(_OfSatellites):
-    """Reception between houses: C/N0 walks randomly, and pseudoranges have multipath errors.
+    """Disturbance by reception between houses: C/N0 walks randomly, pseudoranges have multipath errors.
 
     The random numbers of a measurement: S normals of the walk, S of the errors, S uniforms of their durations.
     """
@@ -276,7 +277,7 @@ class Reflections(_OfSatellites):
         self.normals: int = 2 * self.row_uniforms
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Reception:
-        """Return the state with the drawn initial C/N0 of each satellite.
+        """Draw the initial C/N0 of each satellite.
 
         It is drawn under an open sky, too, so that all scenarios use the same random numbers.
         """
@@ -284,7 +285,7 @@ class Reflections(_OfSatellites):
         none = self.xp.stack([zero] * self.satellites)
         return Reception(zero, cn0, none, none)
 
-    def complete(self, state: Reception, draws: Draws) -> Reception:
+    def draw_further(self, state: Reception, draws: Draws) -> Reception:
         """Return the state with the drawn choice whether the episode is between houses."""
         urban = _draw_share(draws, "urban", self.parameters, state.urban)
         return state._replace(
@@ -292,7 +293,7 @@ class Reflections(_OfSatellites):
         )
 
     def advance(self, state: Reception, step: DisturbanceInput) -> Reception:
-        """Return the state with C/N0 walked between its limits, and new multipath errors where old ones have ended."""
+        """Return the state with C/N0 walked between limits, and multipath errors renewed where old ones ended."""
         xp, p, S = self.xp, self.parameters, self.satellites
         if not p.urban:
             return state
@@ -327,14 +328,12 @@ class Reflections(_OfSatellites):
         return state, measurement._replace(cn0=state.cn0)
 
     def context(self, state: Reception) -> dict[str, Array]:
-        """Return the context: whether the episode is between houses, by name."""
+        """Return whether the episode is between houses, by name."""
         return {"urban": state.urban}
 
 
 def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
-    """Return ones with the probability ``name_probability``, else zeros, ``(N,)``; at 0 or 1 no random number is
-    used.
-    """
+    """Draw ones with the probability ``name_probability``, else zeros, ``(N,)``; 0 and 1 need no random number."""
     share = getattr(parameters, f"{name}_probability")
     if not getattr(parameters, name) or share == 1.0:
         return zero + float(getattr(parameters, name))
@@ -342,7 +341,7 @@ def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
 
 
 class Ramp(_Hidden):
-    """A pseudorange that drifts off from some time to the end.
+    """Disturbance by a pseudorange that drifts off from some time to the end; unreported.
 
     The further state is its initial and its present error, m, ``(2, N)``.
     """
@@ -351,10 +350,10 @@ class Ramp(_Hidden):
     causes = (Cause("wrong range", f"where a pseudorange is off by more than {PULLED:g} m", _is_pulled),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Return the disturbance's state without a ramp; :meth:`complete` draws one."""
+        """Return the state without a ramp, which :meth:`draw_further` draws."""
         return Fault(self.xp.stack([zero - 1.0] * 2), zero[None], self.xp.stack([zero] * 2), zero)
 
-    def complete(self, state: Fault, draws: Draws) -> Fault:
+    def draw_further(self, state: Fault, draws: Draws) -> Fault:
         """Return the state with the drawn start, satellite and initial error of the ramp."""
         xp, p, zero = self.xp, self.parameters, state.now
         if not p.ramp_probability:
@@ -379,28 +378,26 @@ class Ramp(_Hidden):
         return errors + self.xp.where(self.is_at(state), state.own[1], 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the context: window, satellite and initial error of the ramp, by name."""
+        """Return window, satellite and initial error of the ramp, by name."""
         own = {"ramp_satellite": state.satellites[0], "ramp_jump": state.own[0]}
         return {**super().context(state), **own}
 
 
 class Aperture(_OfSatellites):
-    """Tracking loops that lose signals too far from the combined prediction; the state is one where they do,
-    ``(N,)``.
-    """
+    """Disturbance by tracking loops that lose signals far from the prediction; state: one where they do, ``(N,)``."""
 
     name = "aperture"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return zeros, the disturbance's state without an aperture; :meth:`complete` draws one."""
+        """Return zeros: the state without an aperture, which :meth:`draw_further` draws."""
         return zero
 
-    def complete(self, state: Array, draws: Draws) -> Array:
-        """Return the drawn state: one in episodes whose tracking loops have an aperture, else zero, ``(N,)``."""
+    def draw_further(self, state: Array, draws: Draws) -> Array:
+        """Draw the state: one in episodes whose tracking loops have an aperture, else zero, ``(N,)``."""
         return _draw_share(draws, "aperture", self.parameters, state)
 
     def change_measurement(self, state: Array, measurement: Any, step: DisturbanceInput) -> tuple[Array, Any]:
-        """Return the state, and the measurement with ranges and rates outside the aperture missing.
+        """Return the state, and the measurement without ranges and rates outside the aperture.
 
         The aperture is centred on the predicted state ``(17, N)``.
         """
@@ -414,7 +411,7 @@ class Aperture(_OfSatellites):
         return state, self.change_available(measurement, 0, self.xp.astype(kept, feedback.dtype))
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the context: whether the tracking loops have an aperture, by name."""
+        """Return whether the tracking loops have an aperture, by name."""
         return {"aperture": state}
 
 

@@ -16,9 +16,9 @@ a Gaussian sum. Accelerometer readings that repeat exactly are excluded: noise n
 
 Reading: levels and renewals are weighted under each hypothesis on the motion, and the levels then averaged over them.
 
-It is the estimator ``fault-hypotheses`` of the baselines, and the filter that the control ``hypotheses`` steers. Before
-the readings the hypotheses on the motion have probabilities p', each range error j is drawn anew with the probability
-p_j, and the level l of every rate has the probability q'(l). Factors f of its settings change the update:
+The control ``hypotheses`` steers this estimator, ``fault-hypotheses``. Before the readings the hypotheses on the
+motion have probabilities p', each range error j is drawn anew with the probability p_j, and the level l of every rate
+has the probability q'(l). Factors f of its settings change the update:
 
     p'(begun) <- p'(begun) f1,  p'(manoeuvre) <- p'(manoeuvre) f2                          renormalised by Bayes' rule
     p_j / (1 - p_j) <- f3 p_j / (1 - p_j)
@@ -54,7 +54,7 @@ CN0_LIMITS = (30.0, 38.0, 44.0)
 
 
 class FaultPrior(NamedTuple):
-    """Prior of the bank."""
+    """Prior of the bank on motion, range errors and noise levels."""
 
     quiet: float = 1.0
     """Time from the start within which no leg ends, s."""
@@ -106,7 +106,7 @@ VAGUE = FaultPrior(
 
 
 class Hypotheses(NamedTuple):
-    """Hypotheses of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
+    """Hypotheses on motion, rates' noise levels and last accelerometer readings; n = 17 + S states, M = 3."""
 
     means: Array
     """Means, ``(n, M, N)``."""
@@ -121,7 +121,7 @@ class Hypotheses(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Factors on the prior at one measurement, ``(N,)`` or a number."""
+    """Factors of the settings at one measurement, ``(N,)`` or a number each."""
 
     begun: Array = 1.0
     """Factor on the probability that a manoeuvre has begun at this step."""
@@ -145,9 +145,9 @@ UNCHANGED = Factors()
 
 
 class Posterior(NamedTuple):
-    """Posterior of the bank after a measurement.
+    """Posterior of the bank's four hypotheses after a measurement.
 
-    Its four hypotheses are those on the motion, and a manoeuvre that has begun.
+    They are those on the motion, and a manoeuvre that has begun.
     """
 
     after: "FaultState"
@@ -166,7 +166,7 @@ class Posterior(NamedTuple):
 
 
 class FaultState(NamedTuple):
-    """State of the bank."""
+    """State of the bank over motion and sensor faults."""
 
     mean: Array
     """Mean of all hypotheses together, ``(17, N)``."""
@@ -177,11 +177,9 @@ class FaultState(NamedTuple):
 
 
 class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState]):
-    """Extended Kalman filters over hypotheses on the motion, with pseudorange errors and noise levels of rates.
+    """Estimator ``fault-hypotheses``: Kalman filters over motion, pseudorange errors and rates' noise levels.
 
     Args:
-        task: the problem.
-        prior: of motion and faults.
         **changed: fields of the prior.
     """
 
@@ -252,7 +250,6 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
     def _predict(
         self, memory: Hypotheses, measurement: Measurement, between: Array, factors: Factors
     ) -> tuple[Array, Array, Array]:
-        """Return the mean, covariance and probability predicted under each of the four hypotheses."""
         xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
         number = xp.astype(measurement.number, memory.means.dtype)
         # Half a step further, or rounding would choose the measurement at which the time is over.
@@ -300,7 +297,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         return xp.where(between, 1.0, self.open_sky), xp.where(between, 0.0, self.gained)
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
-        """Return the distributions of range errors that may have been drawn anew, one for each satellite."""
+        """Return the distribution of each satellite's range error in case it is drawn anew."""
         xp, prior = self.xp, self.prior
         first = measurement.number <= 1
         renewals = []
@@ -325,8 +322,8 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         """Return the posterior of hypotheses, levels and renewals given a measurement, with factors on the prior.
 
         Args:
-            state: after the measurement before.
-            measurement: that arrives.
+            state: state after the previous measurement.
+            measurement: readings of all sensors.
             factors: on the prior. Probabilities need not sum to one with them; then neither the log-likelihood
                 nor the NIS is that of a density.
         """
@@ -428,7 +425,6 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _move_levels(self, levels: Array) -> Array:
-        """Return the predicted probabilities of the levels after a step, ``(L, N)``."""
         L = levels.shape[0]
         return self.xp.stack(
             [

@@ -63,7 +63,7 @@ class HypothesesState(NamedTuple):
 
 
 class FaultHypothesesBank(SettingsBank, SatelliteBank):
-    """Bank of ``hypotheses``: the bank over motion and faults with factors on probabilities and noises."""
+    """Bank of ``hypotheses``: estimator ``fault-hypotheses`` with factors on probabilities and noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
     hypotheses: Sequence[str] = (*HYPOTHESES, "begun")
@@ -75,7 +75,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of the paper's bank, and probabilities of this bank."""
+        """Observation blocks of the paper's bank, and others, such as probabilities of motion and faults."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         units = task.constant([0.5 * math.log(2.0 * math.pi * r) for r in task.sensor_variance])[:, None]

@@ -1,8 +1,8 @@
 r"""The filter of TightlyCoupledNavigation inside the learned estimator ``kalman-net``, which a recurrent network
 steers.
 
-One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the motion.
-At every measurement the network outputs numbers in [-1, 1]:
+One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the
+motion. At every measurement the network outputs numbers in [-1, 1]:
 
     noise    the groups of sensors, accelerometers that repeat themselves, and outliers of ranges and rates, as under
              control ``robust`` at its full range
@@ -11,9 +11,8 @@ At every measurement the network outputs numbers in [-1, 1]:
              k = P h^T / (h P h^T + g r),  P -= k u^T + u k^T,  u = P h^T - k (h P h^T + r) / 2         (Joseph form)
 
 All zero is the policy ``singer``, the paper's third hypothesis alone, except for the state that steers the tracking
-loops where there are apertures: for ``singer`` it is predicted by all three hypotheses, here by this filter. In place
-of the paper's hypotheses of rest, constant velocity and manoeuvre the network sets the noise of the motion. References
-and reading are in ``maneuvering_target/kalman_net.py``.
+loops where there are apertures: for ``singer`` it is predicted by all three hypotheses, here by this filter.
+References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
@@ -41,7 +40,7 @@ DROPPED = ("log_likelihood", "log_predicted")
 
 
 class KalmanNetBank(RobustBank):
-    """Bank of ``kalman-net``: one extended Kalman filter, whose noises, gain and motion the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises, gain and motion of a Kalman filter."""
 
     hypotheses: Sequence[str] = HYPOTHESES[SINGER:]
     reach: float = 1.0  # it learns through the filter, and does not explore
@@ -67,7 +66,7 @@ class KalmanNetBank(RobustBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of the paper's filters, and the deviations of this filter."""
+        """Observation blocks of the paper's filters, and the standard deviations of this filter."""
         xp, p = self.xp, self.parameters
         parts = {
             "position": (gnss_ins.POSITION, p.position_unit),
@@ -89,13 +88,12 @@ class KalmanNetBank(RobustBank):
         return (*shown, sure, last)
 
     def start(self, initial: Initial) -> Filters:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         state = super().start(initial)
         certain = state.log_likelihood
         return state._replace(log_predicted=certain, probabilities=1.0 + certain)
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Return the prediction with the motion noise that the last action set."""
         common = self.task.common
         factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.action[self.manoeuvre])
         noise = self.common_noise + factor * self.manoeuvre_noise
@@ -136,7 +134,7 @@ class KalmanNetBank(RobustBank):
         return unpack(state.covariances[:, 0], gnss_ins.SIZE)
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the paper's bank without probabilities, by name."""
+        """Return the records of the paper's bank, without probabilities, by name."""
         records = super().records(state, measurement)
         del records["mode_probability"]
         return records

@@ -9,7 +9,7 @@ from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class ReceiverInput(LiveInput):
-    """Converter of sensor readings by name, INS angles and satellite positions into measurements."""
+    """Converter of live sensor readings, INS angles and satellite positions into measurements."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return the names and descriptions of the values of a measurement, and of those at the start."""

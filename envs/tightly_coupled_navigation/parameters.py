@@ -28,7 +28,7 @@ LARGEST_RATIO = 1e6
 
 
 class SensorGroup(NamedTuple):
-    """Group of sensors of one kind."""
+    """Group of sensors of one kind: places of their readings, standard deviation, aperture."""
 
     name: str
     readings: slice
@@ -41,7 +41,7 @@ class SensorGroup(NamedTuple):
 
 @dataclass(frozen=True)
 class TightlyCoupledNavigationParameters(TaskParameters):
-    """Constants of the task; each is a keyword of ``gym.make``. "ours": the paper gives no value."""
+    """Constants of TightlyCoupledNavigation; "ours": the paper gives no value."""
 
     course: str = parameter("random", choices=("increment", "kinematic", "matched", "random"))
     """Motion of the user: "increment" (the paper), "kinematic", "matched" or "random"."""
@@ -257,7 +257,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
             satellites.dilution_of_precision(first / numpy.sqrt((first**2).sum(axis=0)))
 
     def _check_digits(self) -> None:
-        """Raise ValueError if a sensor is so much better than the prior that a covariance update loses all digits."""
+        """Raise ValueError if a sensor is so much better than the prior that an update loses all digits."""
         for sensor, unknowns in KNOWN_BY.items():
             known = getattr(self, sensor)
             for name in unknowns:
@@ -282,12 +282,12 @@ class TightlyCoupledNavigationParameters(TaskParameters):
 
     @property
     def site(self) -> tuple[float, float, float]:
-        """Latitude and longitude, rad, and height, m, of the site."""
+        """Latitude and longitude, rad, and height, m, of the origin of east, north and up."""
         return self.latitude * DEGREE, self.longitude * DEGREE, self.height
 
     @property
     def sensors(self) -> tuple[SensorGroup, ...]:
-        """All groups of sensors (:class:`SensorGroup`), in the order of the readings."""
+        """All groups of sensors, in the order of the readings."""
         ranges, rates, forces, angles = gnss_ins.sensor_groups(len(self.satellites))
         return (
             SensorGroup("pseudoranges", ranges, self.pseudorange_sigma, self.range_aperture),

@@ -34,7 +34,7 @@ ACTIONS: dict[str, tuple[str, ...]] = {
 
 
 class TightlyCoupledNavigationPicture(Picture):
-    """Picture of course, acceleration and sensor faults; weights or noise factors, innovations, errors."""
+    """Picture of course, acceleration, sensor faults, weights or noise factors, innovations, errors."""
 
     strips_left: float = 0.56
     strip_columns = 1
@@ -49,7 +49,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the values drawn at a step by name: positions (m), accelerations, weights, innovations, errors."""
+        """Return the values that the picture shows at a step by name, such as positions (m) and errors."""
         task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
         error = self.model.error(state)[:, lane]
         P = numpy.diagonal(self.model.covariance(state)[:, :, lane])
@@ -79,7 +79,7 @@ class TightlyCoupledNavigationPicture(Picture):
         return {name: float(value) for name, value in values.items()}
 
     def begin(self, state: Episode) -> None:
-        """Simulate the truth in advance, for the intervals of manoeuvres and faults, which do not depend on noise."""
+        """Simulate the truth in advance, to find the intervals of manoeuvres and sensor faults."""
         task, truth = self.task, state.truth
         still = numpy.zeros((task.noise.normals + task.noise.row_uniforms, truth.step.shape[-1]))
         modes = []
@@ -100,7 +100,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series of actions, innovations and errors."""
+        """Return the time series of the picture: actions, innovations and errors."""
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
@@ -128,11 +128,11 @@ class TightlyCoupledNavigationPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return False: the time series show the filters' quantities instead of the observation."""
+        """Return False: the picture shows the filters' quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the intervals of manoeuvres, which are shaded."""
+        """Return the intervals of manoeuvres, which the picture shades."""
         return self.motions[SINGER]
 
     # --- panels
@@ -189,12 +189,11 @@ class TightlyCoupledNavigationPicture(Picture):
         self.now: Line2D = sensors.plot([], [], color=BLACK, linewidth=0.8)[0]
 
     def arrange(self) -> None:
-        """Set the axis limits of the start; they grow with the flight, which is not known in advance."""
+        """Set the axis limits of the picture at the start; they grow with the flight."""
         self._show_course(numpy.empty((2, 0)))
         self.motion.set_ylim(0.0, ACCELERATION_LIMIT)
 
     def _show_course(self, places: numpy.ndarray) -> None:
-        """Set the limits of the course panel so that it contains the positions, at equal scales."""
         sides = []
         for values in places:
             low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
@@ -236,9 +235,7 @@ class TightlyCoupledNavigationPicture(Picture):
 
 
 def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
-    """Return the intervals of steps, counted from 1, in which a flag is true; they extend half a step on either
-    side.
-    """
+    """Return the intervals of steps, counted from 1, in which a flag is true, half a step longer on either side."""
     steps = 1 + numpy.flatnonzero(flags)
     if not len(steps):
         return []
@@ -247,7 +244,6 @@ def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
 
 
 def _segments(runs: Sequence[tuple[float, float]], row: float) -> tuple[list[float], list[float]]:
-    """Return the coordinates of one broken line along a row."""
     x = [value for first, last in runs for value in (first, last, numpy.nan)]
     return x, [row] * len(x)
 

@@ -10,7 +10,7 @@ from .parameters import DEGREE, SensorGroup, TightlyCoupledNavigationParameters
 
 
 class NavigationProblem(Task):
-    """Base class of the task: sensors, orbits of the satellites, and models of motion and errors."""
+    """Base class of the task: sensors, satellite orbits, and models of motion and errors."""
 
     parameters: TightlyCoupledNavigationParameters
 
@@ -53,11 +53,10 @@ class NavigationProblem(Task):
         self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
-        """Return the row of a measurement in the tables; beyond the episode the last row."""
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:
-        """Return the positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
+        """Return positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
         row = self._row(number)
         return (
             self.xp.take(self._satellite_position, row, axis=2),

@@ -1,11 +1,10 @@
 r"""A bank over faults of one pseudorange: a filter of healthy satellites, and one for a fault of each satellite.
 
-Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump rarely and then walks
-at random, so that this pseudorange gives little information on the position from the start on, and a slowly growing
-fault cannot bias the estimate before it is detected (solution separation: R. G. Brown and P. W. McBurney,
-Self-contained GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is
-wrong. Faults begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of
-satellite j,
+Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump rarely and then
+walks at random, so that a slowly growing fault cannot bias its estimate before it is detected (solution separation: R.
+G. Brown and P. W. McBurney, Self-contained GPS integrity check using maximum solution separation, Navigation 35,
+1988). At most one pseudorange is wrong. Faults begin at a rate h, of all satellites together, and last. With weights
+w0 of no fault and wj of that of satellite j,
 
     w0' = (1 - h T) w0,    wj' = wj + h T w0 / S,
 
@@ -25,11 +24,10 @@ from .world import Measurement
 
 
 class OneFault(FaultHypotheses):
-    """Member of the bank: the error of one pseudorange jumps and walks randomly, those of the others follow the prior.
+    """Member of a bank: the error of one pseudorange jumps and walks randomly, the others follow the prior.
 
     Args:
-        task: the problem.
-        prior: of motion and faults; its jumps are those of this pseudorange.
+        prior: prior of motion and faults; its jumps are those of this pseudorange.
         wrong: number of the satellite.
         walk: standard deviation of its error's random walk in a second, m.
     """
@@ -57,7 +55,7 @@ class OneFault(FaultHypotheses):
 
 
 class SatelliteFaultState(NamedTuple):
-    """State of the bank."""
+    """State of the bank over faulty satellites: its members, their weights, the likelihood."""
 
     members: tuple[FaultState, ...]
     """States of the members: without a fault, and with one of each satellite."""
@@ -67,11 +65,9 @@ class SatelliteFaultState(NamedTuple):
 
 
 class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState]):
-    """Bank of `fault-hypotheses` filters: one without, and one with a lasting fault of each pseudorange.
+    """Estimator by a bank of :class:`FaultHypotheses`: no fault, or a lasting fault of one pseudorange.
 
     Args:
-        task: the problem.
-        prior: of all members.
         begins: expected number of faults per second, of all satellites together.
         walk: standard deviation of the wrong pseudorange's random walk in a second, m.
         **changed: fields of the prior.
@@ -119,11 +115,11 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         return SatelliteFaultState(members, weights, found)
 
     def mean(self, state: SatelliteFaultState) -> Array:
-        """Return the mean of all members together, ``(17, N)``."""
+        """Return the weighted mean of all members, ``(17, N)``."""
         return weighted_sum(state.weights, self.xp.stack([member.mean for member in state.members], axis=1))
 
     def covariance(self, state: SatelliteFaultState) -> Array:
-        """Return the covariance of all members together, ``(17, 17, N)``."""
+        """Return the covariance of the weighted mean, with the spread of the members, ``(17, 17, N)``."""
         means = self.xp.stack([member.mean for member in state.members], axis=1)
         covariances = self.xp.stack([member.covariance for member in state.members], axis=2)
         found: Array = imm.combine(means, covariances, state.weights)[1]

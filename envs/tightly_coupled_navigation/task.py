@@ -37,8 +37,7 @@ from .world import NavigationWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported here, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 
@@ -184,9 +183,7 @@ class TightlyCoupledNavigation(NavigationProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """Return the state that steers the tracking loops, ``(17, N)``: the estimate, extrapolated as in a
-        manoeuvre.
-        """
+        """Return the state that steers the tracking loops, ``(17, N)``: the estimate, extrapolated as a manoeuvre."""
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
 
 

@@ -73,7 +73,7 @@ class Measurement(NamedTuple):
 
 
 class NavigationWorld(World[Task, Truth, Measurement]):
-    """World of an aircraft with a satellite receiver and an inertial system."""
+    """World of an aircraft with a satellite receiver and an inertial system (INS)."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -103,12 +103,12 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return self.task.sensor_sigma + 0.0 * measurement.readings
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Return the drawn truth (legs, disturbances, initial errors) and the initial estimate."""
+        """Draw legs, disturbances and initial errors; return this truth, and the initial estimate."""
         xp, p = self.xp, self.parameters
         zeros = xp.zeros_like(normals[0])
         legs, velocity, heading = self.course.begin(draws, zeros)
         states = self.disturbances.begin(draws, normals[gnss_ins.SIZE :], zeros)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         states = self.disturbances.switch_off(states, draw_undisturbed(draws, p))
         between_houses = states["reflections"].urban > 0.0
         velocity = xp.where(between_houses, p.urban_speed * velocity, velocity)
@@ -138,10 +138,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     def advance(self, truth: Truth, noise: Array, feedback: Array | None) -> tuple[Truth, Measurement]:
         """Return the truth after one step, and the measurement with noise and disturbances.
 
-        Args:
-            truth: at the measurement before.
-            noise: see :class:`.World`.
-            feedback: where tracking loops have an aperture, the state ``(17, N)`` that they expect.
+        ``feedback`` is the state ``(17, N)`` that tracking loops with an aperture expect.
         """
         xp, p, task = self.xp, self.parameters, self.task
         step = truth.step + 1
@@ -176,7 +173,6 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
-        """Return the state at step k, the hypothesis that it follows, and whether its acceleration has jumped."""
         xp, common, c = self.xp, self.task.common, self.clock_root
         moved = gnss_ins.advance(truth.state, self.task.axis[:, :, SINGER], common.T, common.decay)
         w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))
@@ -196,11 +192,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: time, true hypothesis, and one where a sensor fails.
+        """Return time, true hypothesis, whether a sensor fails, and values of disturbances, to record, by name.
 
-        Failures are a rate noisier than stated, stuck accelerometers, and a pseudorange with an error above five
-        standard
-        deviations.
+        Failures are a noisier rate, stuck accelerometers, and a pseudorange error above five standard deviations.
         """
         xp, p = self.xp, self.parameters
         seconds = p.sampling_interval * xp.astype(truth.step, truth.state.dtype)
@@ -214,7 +208,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context by name: legs, disturbances, true hypothesis, and noise and errors of readings."""
+        """Return legs, disturbances, true hypothesis, and noise and errors of readings, by name."""
         return {
             "leg_start": truth.legs.start,
             "leg_kind": truth.legs.kind,

@@ -37,7 +37,7 @@ FLOORED_LOG = Compression(
 
 
 class KalmanState(NamedTuple):
-    """State of the Kalman filter."""
+    """State of the Kalman filter, with the estimate that the autopilot uses and innovation statistics."""
 
     mean: Array
     """Mean, predicted after ``predict`` and updated after ``act``, ``(n, N)``."""
@@ -66,7 +66,7 @@ class KalmanState(NamedTuple):
 
 
 class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
-    """Base class of all banks: the observation blocks and the innovation statistics."""
+    """Base class of the banks in the control loop: observation blocks and innovation statistics."""
 
     parameters: UavAutopilotParameters
     action_block: Any
@@ -83,7 +83,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of filter and autopilot; sigmas are those of the filter before the action."""
+        """Observation blocks of filter and autopilot, such as innovations, readings, command and control."""
         sensors, horizon = self.task.sensors, self.task.horizon
         unit = 1.0 / self.task.output_sigma
         return (
@@ -160,17 +160,13 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def log_trace(self, state: Any) -> Array:
-        """Return the logarithm of the trace of the predicted covariance, ``(N,)``."""
+        """Return the log-trace of the predicted covariance, ``(N,)``; subclasses define it."""
         raise NotImplementedError
 
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
-        """Return the state with the innovations, NIS, log-likelihood and averages at a measurement filled in.
+        """Return the state with innovations, NIS, log-likelihood and averages at a measurement filled in.
 
-        Args:
-            state: state before the measurement.
-            measurement: the new measurement.
-            readings: predicted readings, ``(m, N)``.
-            S: covariance of the innovations of all sensors, ``(m, m, N)``.
+        ``readings`` are predicted, ``(m, N)``; S is the covariance of the innovations, ``(m, m, N)``.
         """
         xp, available, m = self.xp, measurement.available, len(self.task.sensors)
         residual = available * (measurement.reading - readings)
@@ -191,10 +187,10 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: NIS, log-likelihood, normalised innovation.
+        """Return NIS, log-likelihood and a normalised innovation to record at a measurement, by name.
 
-        NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the
-        output is not measured.
+        NIS and log-likelihood are NaN in a dropout of all sensors. The innovation is that of the output, or if it is
+        not measured of the first sensor.
         """
         task, xp = self.task, self.xp
         count = ordered_sum(measurement.available)
@@ -225,16 +221,13 @@ class _KalmanBank(AutopilotBank):
         self.diagonal: list[int] = packed_covariance.diagonal(n)
 
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
-        """Return the process noise times a factor ``(N,)`` at some entries of the packed matrix, ``(entries, N)``."""
         return scale * self.process_noise[entries]
 
     def log_trace(self, state: KalmanState) -> Array:
-        """Return the logarithm of the trace of the covariance predicted with the last action's noise, ``(N,)``."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> KalmanState:
-        """Return the bank's state at the start of the track, with the averages of a consistent filter."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0
@@ -255,7 +248,7 @@ class _KalmanBank(AutopilotBank):
         )
 
     def predict(self, state: KalmanState, measurement: Measurement) -> KalmanState:
-        """Return the state predicted by equation (10), with innovations for the process noise of the last action."""
+        """Return the state predicted by equation (10), with innovations under the last action's noise."""
         m = len(self.task.sensors)
         mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = self.xp.matmul(self.propagator, state.covariance)
@@ -265,21 +258,18 @@ class _KalmanBank(AutopilotBank):
         return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the action as observed, ``(A, N)``, and the factor that it sets on the process noise, ``(N,)``."""
+        """Return the observed action, ``(A, N)``, and its factor on the process noise, ``(N,)``; abstract."""
         raise NotImplementedError
 
     def sensor_variances(self, action: Array) -> Any:
-        """Return the variance of each sensor's reading for the update, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(
         self, update: packed_covariance.PackedUpdate, measurement: Measurement, action: Array
     ) -> tuple[Array, Array]:
-        """Return the estimate that the autopilot uses, and its packed covariance."""
         return update.mean, update.covariance
 
     def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
-        """Return the state updated by equations (12) and (11) with the process and sensor noises of the action."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,
@@ -300,11 +290,9 @@ class _KalmanBank(AutopilotBank):
         )
 
     def mean(self, state: KalmanState) -> Array:
-        """Return the estimate that the autopilot uses, ``(n, N)``."""
         return state.estimate
 
     def covariance(self, state: KalmanState) -> Array:
-        """Return the reported covariance of that estimate, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
 
@@ -324,8 +312,8 @@ class GainBank(_KalmanBank):
     def covariance(self, state: KalmanState) -> Array:
         """Return the filter's covariance, ``(n, n, N)``, under an action inflated by the average NIS if above one.
 
-        The factor applies only under nonzero actions, because only the innovations show whether the action fits the
-        noise. Under the action zero it is the paper's filter with the paper's covariance.
+        Under the action zero it is the paper's covariance; only the innovations show whether another action fits the
+        noise.
         """
         factor = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
         return super().covariance(state) * factor
@@ -382,7 +370,7 @@ class ModeBank(_KalmanBank):
         self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the selected mode (one-hot), and its factor on the process noise."""
+        """Return the selected mode, one-hot, and its factor on the process noise."""
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]

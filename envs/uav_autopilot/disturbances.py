@@ -28,15 +28,13 @@ def draw_steps(
     zero: Array,
     count: int | None = None,
 ) -> StepSignal:
-    """Return a drawn step signal: its level in each part of the episode, and the first measurement of each part."""
+    """Draw a step signal: its level in each part of the episode, and the first measurement of each part."""
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
     return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
 
 
 class _OfSensors(Disturbance):
-    """Base class of disturbances of all m sensors, or of some."""
-
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
         self.task = task
@@ -49,7 +47,7 @@ class _OfSensors(Disturbance):
 
 
 class SensorLevels(NamedTuple):
-    """State of :class:`NoisySensors`."""
+    """State of the sensors' noise: step signals of factors, and those at this measurement."""
 
     levels: StepSignal
     """Factors on the sensors' noise in each part, ``(J + 1, m, N)``."""
@@ -58,7 +56,7 @@ class SensorLevels(NamedTuple):
 
 
 class NoisySensors(_OfSensors):
-    """White noise of sensors that differs from nominal and changes during the episode."""
+    """Disturbance by white sensor noise that differs from nominal and changes during the episode."""
 
     name = "noisy_sensors"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -70,7 +68,7 @@ class NoisySensors(_OfSensors):
     )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
-        """Return the drawn factors on the sensors' noise and the times of their changes."""
+        """Draw the factors on the sensors' noise and the times of their changes."""
         p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
         levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
@@ -90,12 +88,12 @@ class NoisySensors(_OfSensors):
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
-        """Return the context: all factors on the noise, and the measurements at which they change, by name."""
+        """Return all factors on the sensors' noise, and the measurements at which they change, by name."""
         return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
 
 
 class Holds(NamedTuple):
-    """State of :class:`Dropouts`."""
+    """State of the sensors' dropouts: their starts and ends, and the last valid readings."""
 
     starts: Array
     """First measurement without a reading, ``(D, m, N)``."""
@@ -106,13 +104,13 @@ class Holds(NamedTuple):
 
 
 class Dropouts(_OfSensors):
-    """Dropouts of a sensor, one in each period, during which it repeats its last reading."""
+    """Disturbance by dropouts of a sensor, one in each period, during which it repeats its last reading."""
 
     name = "dropouts"
     causes: ClassVar[tuple[Cause, ...]] = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
-        """Return the drawn first and last measurements of the sensors' dropouts."""
+        """Draw the first measurements of the sensors' dropouts, and the first ones after them."""
         xp, p = self.xp, self.parameters
         none = xp.stack([zero] * self.count)
         starts, stops = [none], [none]
@@ -124,7 +122,7 @@ class Dropouts(_OfSensors):
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
     def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
-        """Return the state, and the measurement with each sensor's last valid reading repeated during a dropout."""
+        """Return the state, and the measurement in which sensors in a dropout repeat their last valid reading."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
             out = is_within(step.number, (state.starts[i], state.stops[i]))
@@ -134,17 +132,17 @@ class Dropouts(_OfSensors):
         return state._replace(reading=reading), measurement
 
     def context(self, state: Holds) -> dict[str, Array]:
-        """Return the context: first measurements of the dropouts and those after them, by name."""
+        """Return the first measurements of the dropouts, and the first ones after them, by name."""
         return {"dropout_starts": state.starts, "dropout_stops": state.stops}
 
 
 class SensorBias(_OfSensors):
-    """Constant errors of sensors; the state is the error in the sensor's unit, ``(m, N)``."""
+    """Disturbance by constant sensor errors, which are its state, in the sensor's unit, ``(m, N)``."""
 
     name = "bias"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return the drawn constant errors of the sensors, ``(m, N)``."""
+        """Draw the constant errors of the sensors, ``(m, N)``."""
         xp, limits = self.xp, self.parameters.sensor_bias
         if not limits[1]:
             return xp.stack([zero] * self.count)
@@ -161,12 +159,12 @@ class SensorBias(_OfSensors):
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the context: the sensors' constant errors, by name."""
+        """Return the sensors' constant errors, by name."""
         return {"sensor_bias": state}
 
 
 class SensorColour(ColouredErrors):
-    """Coloured errors of sensors: first-order Gauss-Markov processes."""
+    """Disturbance by coloured sensor errors: first-order Gauss-Markov processes."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
@@ -174,7 +172,7 @@ class SensorColour(ColouredErrors):
         self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Return the drawn standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
+        """Draw the standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
         p, none = self.parameters, self.xp.stack([zero] * self.count)
         if not self.normals:
             return none, none + 1.0
@@ -186,7 +184,7 @@ class SensorColour(ColouredErrors):
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the context: the coloured errors at this measurement, by name."""
+        """Return the coloured errors at this measurement, by name."""
         return {"sensor_coloured": state.level}
 
 

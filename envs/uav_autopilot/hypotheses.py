@@ -60,7 +60,7 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank, AutopilotBank):
-    """Bank of ``hypotheses``: the bank over noise levels with factors on its weights and noises."""
+    """Bank of ``hypotheses``: estimator ``level-bank`` with factors on its weights and noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
@@ -83,7 +83,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every filter, the log-density of the readings, and the probabilities of the levels."""
+        """Observation blocks of every bank here, and others, such as probabilities of the noise levels."""
         xp, low, high = self.xp, *self.sensor_limits
         unit = math.prod(self.task.sensor_variances) ** 0.5 * (2.0 * math.pi) ** (
             0.5 * len(self.task.sensors)
@@ -152,7 +152,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
     def add_observed(
         self, state: HypothesesState, result: Levels, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the joint innovation, and the probabilities after the readings, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the readings, filled in."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
         whole = noise_levels.merge(h.mean, h.covariance, h.probability)
         P = packed_covariance.unpack(whole.covariance, bank.size)
@@ -185,5 +185,5 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the other banks, with the likelihood and NIS of the estimator, by name."""
+        """Return the records of the other banks, with likelihood and NIS of the estimator, by name."""
         return {**super().records(state, measurement), **state.likelihood._asdict()}

@@ -1,18 +1,17 @@
 r"""The learned estimator ``kalman-net`` of UavAutopilot: a recurrent network sets noises and gain of the filter.
 
-This is the Kalman filter of the paper with two covariances: P of its errors, and M, from which the gain is computed. At
-every measurement the network returns numbers in [-1, 1]: a_l for each part l of the process noise (the part that the
-level of the disturbance multiplies, and the rest), a_i for each sensor i, then b_l and b_i like them:
+This is the Kalman filter of the paper with two covariances: P of its errors, and M, from which the gain is computed.
+At every measurement the network returns numbers in [-1, 1]: a_l for each part l of the process noise (the part that
+the level of the disturbance multiplies, and the rest), a_i for each sensor i, then b_l and b_i like them:
 
     noise    Q_l = 10^(process_decades a_l) Q_l,  R_i = 10^(2 sensor_decades a_i) R_i,  P' = F P F^T + sum_l Q_l
     gain     M' = F M F^T + sum_l agility^(2 b_l) Q_l,  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
-All zero is the paper's filter: M is P. The column of K of a sensor in a dropout is zero. The autopilot uses x.
-M follows the Riccati equation of noises between limits, so that the filter is stable for any output; with P in place
-of M it is not. References and reading are in ``maneuvering_target/kalman_net.py``. The network does not change the
-dynamics, because they are known here.
+All zero is the paper's filter: M is P. The column of K of a sensor in a dropout is zero. The autopilot uses x. M
+follows the Riccati equation of noises between limits, so that the filter is stable for any output; with P in place of
+M it is not. References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
@@ -55,7 +54,7 @@ class NetFilter(NamedTuple):
 
 
 class KalmanNetBank(NoiseBank):
-    """Bank of ``kalman-net``: the paper's filter, whose noises and gain the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises and gain of the paper's filter."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -73,7 +72,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of the bank, without the last valid reading in a dropout, which estimators do not get."""
+        """Observation blocks of the bank, without a dropout's repeated reading, which estimators do not get."""
         reading = Block(
             "reading",
             lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,
@@ -85,9 +84,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box of a factor for each part of the process noise and each sensor, then one more each for the
-        gain.
-        """
+        """Gymnasium box: factors on parts of the process noise and on each sensor's, then the same for the gain."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
@@ -96,14 +93,14 @@ class KalmanNetBank(NoiseBank):
         return last_action_block(self.action_names, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
-        """Return the process noise with its parts times factors ``(L, N)`` at some packed entries, ``(entries, N)``."""
+        """Return the process noise with its parts times factors ``(L, N)``, at packed entries, ``(entries, N)``."""
         total = scale[0] * self.noise_parts[0][entries]
         for factor, part in zip(scale[1:], self.noise_parts[1:], strict=True):
             total = total + factor * part[entries]
         return total
 
     def start(self, initial: Start) -> Any:
-        """Return the paper's filter at the initial estimate, as a :class:`NetFilter`."""
+        """Return the filter of the paper at the initial estimate, as a :class:`NetFilter`."""
         fields = super().start(initial)._asdict()
         fields["scale"] = self.xp.stack([fields["scale"]] * len(self.noise_parts))
         return NetFilter(**fields, gain_covariance=fields["covariance"])

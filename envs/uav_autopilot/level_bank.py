@@ -6,9 +6,9 @@ Rockets 5 (1968), 662-665, by augmentation). In each kind every hypothesis is a 
 own probabilities of the sensors' levels. The first hypothesis of a kind assumes all noise as designed, and ends with a
 small hazard. Kinds do not change.
 
-This is the estimator ``level-bank`` of the baselines, and the control ``hypotheses`` sets factors f of its settings. H
-hypotheses predict to the measurement with weights p' and covariances P'. The factors apply to the update with the
-readings of m sensors at this measurement only:
+The control ``hypotheses`` steers this estimator, ``level-bank``, by factors f of its settings. H hypotheses predict to
+the measurement with weights p' and covariances P'. The factors apply to the update with the readings of m sensors at
+this measurement only:
 
     p'(h) <- p'(h) f1^s(h) f2^designed(h)                                                   renormalised by Bayes' rule
     P'(h) <- P'(h) + (f3 - 1) Q(h),    R_k <- R_k f(3 + k)
@@ -36,7 +36,7 @@ from .world import Measurement, Start
 
 
 class Kind(NamedTuple):
-    """A kind of aircraft: properties that do not change in an episode."""
+    """A kind of aircraft: actuator and slow sensor errors, which do not change in an episode."""
 
     share: float = 1.0
     """Prior probability."""
@@ -51,7 +51,7 @@ class Kind(NamedTuple):
 
 
 class LevelPrior(NamedTuple):
-    """Prior of the bank over noise levels."""
+    """Prior of the bank over noise levels: their ranges and changes, outliers, kinds of aircraft."""
 
     gusts: tuple[float, float] = (0.2, 5.0)
     """Limits of the disturbance's level, log-uniform."""
@@ -103,7 +103,7 @@ def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
 
 
 class Levels(NamedTuple):
-    """State of the bank over noise levels."""
+    """State of the bank over noise levels: estimate, hypotheses, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(n, N)``."""
@@ -121,11 +121,9 @@ def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, x
 
 
 class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
-    """Gaussian sum over noise levels of gusts and sensors that switch at unknown times, merged like an IMM.
+    """Estimator ``level-bank``: Gaussian sum over levels of gusts and sensor noise that switch, merged like an IMM.
 
     Args:
-        task: the problem.
-        prior: the prior.
         **changed: fields of the prior with other values.
     """
 
@@ -187,7 +185,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         """Exponents of the first two factors in each hypothesis' weight, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:
-        """Return the bank's state at the start of the track, all hypotheses at the initial estimate."""
+        """Return all hypotheses at the initial estimate, with their prior probabilities."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
         hypotheses = LevelHypotheses(
@@ -199,19 +197,17 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
     def predict(self, state: Levels, measurement: Measurement) -> Levels:
-        """Return the hypotheses mixed for changes of noise levels, and predicted to the time of a measurement."""
+        """Return the hypotheses mixed for changes of noise levels, and predicted to a measurement."""
         h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where any sensor has a reading, so that an action has an effect, zero elsewhere, ``(N,)``."""
+        """Return 1 where any sensor has a reading, so that an action has an effect, else 0, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
     def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
-        """Return the hypotheses with weights and process noise multiplied by factors, given as logarithms ``(3,
-        N)``.
-        """
+        """Return the hypotheses with weights and process noise times factors, given as logarithms ``(3, N)``."""
         xp = self.xp
         return h._replace(
             probability=xp.exp(ordered_sum(self.raised * logarithms[:2, None])) * h.probability,
@@ -253,7 +249,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def switch(self, memory: LevelHypotheses) -> LevelHypotheses:
-        """Return the hypotheses of every kind mixed for changes of the levels."""
+        """Return the hypotheses of every kind of aircraft mixed for changes of noise levels."""
         xp, each = self.xp, self.change.shape[0]
         parts = [
             noise_levels.switch(
@@ -285,11 +281,9 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
 
 
 class _KindModel:
-    """The plant of a kind with its slow errors, for every level of the gusts, as NumPy arrays.
+    """Plant of a kind of aircraft with its slow sensor errors, for every level of the gusts.
 
     Args:
-        task: the problem.
-        kind: the kind.
         sigmas: nominal standard deviations of the sensors with slow errors.
         levels: levels of the gusts; the first is noise as designed.
     """

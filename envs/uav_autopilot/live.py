@@ -9,7 +9,7 @@ from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class SensorInput(LiveInput):
-    """Converter of sensor readings, command and control into measurements; a dropout repeats the last reading."""
+    """Converter of live sensor readings, command and control into measurements."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return the names and descriptions of the values of a measurement, and of those at the start."""
@@ -32,7 +32,7 @@ class SensorInput(LiveInput):
         return measurement, {**after, "reading": measurement.reading}
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Return the readings with missing ones replaced by the last ones."""
+        """Return the readings, in a dropout the last one again."""
         return numpy.where(there, received, memory["reading"])
 
 

@@ -238,7 +238,7 @@ class UavAutopilotParameters(TaskParameters):
             )
 
     def value(self, name: str) -> Any:
-        """Return the value of a parameter by its name; the plant's default value if it is None."""
+        """Return the value of a parameter by its name; the plant's default where it is None."""
         given = getattr(self, name)
         if given is not None:
             return given

@@ -18,7 +18,7 @@ LEAST = 1.5
 
 
 class UavAutopilotPicture(Picture):
-    """Picture of time series of the loop, the filter, and the true noise levels."""
+    """Picture of UavAutopilot: time series of the loop, the filter, and the true noise levels."""
 
     strip_columns = 2
 
@@ -34,7 +34,7 @@ class UavAutopilotPicture(Picture):
         self.actions: Any = model.filter.action_block.parts
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the values drawn at a measurement by name: signals of the loop, NIS, and noise levels."""
+        """Return the values that the picture shows at a measurement, by name."""
         task, truth, estimator = self.task, state.truth, state.filter
         assert isinstance(estimator, KalmanState | HypothesesState)
         available = state.measurement.available[self.shown, 0] > 0.0
@@ -60,7 +60,7 @@ class UavAutopilotPicture(Picture):
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
     def beliefs(self, estimator: HypothesesState) -> dict[str, float]:
-        """Return the probabilities of hypotheses about the gusts, summed for each drawn line, by name."""
+        """Return the probabilities of hypotheses on the gusts, summed for each drawn line, by name."""
         assert isinstance(self.model.filter, HypothesesBank)
         designed, *others = estimator.probabilities[:, 0]
         stronger = sum(
@@ -70,7 +70,7 @@ class UavAutopilotPicture(Picture):
         return {f"gusts.{name}": float(value) for name, value in zip(GUSTS, values, strict=True)}
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series, of the loop in the left column and of the filter in the right one."""
+        """Return the time series of the picture: of the loop in the left column, of the filter in the right one."""
         task = self.task
         output = task.components[task.output]
         name, unit = CONTROL[task.parameters.plant]
@@ -115,7 +115,7 @@ class UavAutopilotPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return True: the observation fills the eighth panel."""
+        """Return True: the observation fills the picture's eighth panel."""
         return True
 
 

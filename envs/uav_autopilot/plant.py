@@ -11,7 +11,7 @@ from .parameters import COORDINATES, OUTPUT, UavAutopilotParameters
 
 
 class Plant(NamedTuple):
-    """Discrete plant with its noise in two parts, as NumPy arrays."""
+    """Discrete plant of the control loop with its noise in two parts, as NumPy arrays."""
 
     F: numpy.ndarray
     """Transition matrix (7), ``(n, n)``."""
@@ -24,7 +24,7 @@ class Plant(NamedTuple):
 
 
 def constant_rate(parameters: UavAutopilotParameters) -> Plant:
-    """Return the plant P, a double integrator: ``F = [[1, T], [0, 1]]`` (paper).
+    """Return the :class:`Plant` P, a double integrator: ``F = [[1, T], [0, 1]]`` (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
     enters with the control are ours.
@@ -36,7 +36,7 @@ def constant_rate(parameters: UavAutopilotParameters) -> Plant:
 
 
 def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Plant:
-    """Return the plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
+    """Return the :class:`Plant` U: short period, pitch, actuator and gust of a small aircraft, degrees and deg/s.
 
     With the aerodynamic angle ``a = incidence + gust``:
     ``incidence' = rate - Z_a a - Z_d elevator``, ``rate' = M_a a + M_q rate + M_d elevator + w_q``,
@@ -108,13 +108,6 @@ MOST_CONDITION = 1e14
 
 
 def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> None:
-    """Raise ValueError if a sensor's variance is lost in the rounding of the predicted variance.
-
-    Args:
-        parameters: parameters of the plant.
-        ratios: predicted variance of each reading in steady state over that of the sensor; a process noise s times as
-            large makes it at most s times as large.
-    """
     p = parameters
     scale = max(p.wide_band_scale, 10.0**p.gain_decades, 10.0 ** (p.process_decades + 2.0 * p.sensor_decades))
     worst = int(numpy.argmax(ratios))
@@ -128,7 +121,7 @@ def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> 
 
 @functools.lru_cache(8)  # an evaluation makes the same task for every competitor, on numbers and on symbols
 def design(parameters: UavAutopilotParameters) -> Design:
-    """Return the design of the control loop for these parameters, from a cache.
+    """Return the :class:`Design` of the control loop for these parameters, from a cache.
 
     Raises:
         ValueError: if the plant diverges at once, L does not stabilise it, or the sensors do not determine the state.

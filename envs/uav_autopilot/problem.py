@@ -32,11 +32,10 @@ class AutopilotProblem(Task):
         self._L = self.constant(self.design.feedback)
 
     def _sampling_interval(self) -> float:
-        """Return the sampling interval, s, the plant's default if the parameter is None."""
         return float(self.parameters.value("sampling_interval"))
 
     def autopilot(self, estimate: Array, command: Array) -> Array:
-        """Return the control ``u = N r - L x(k|k)``, ``(N,)``, from estimate ``(n, N)`` and command ``(N,)``."""
+        """Return the autopilot's control ``u = N r - L x(k|k)``, ``(N,)``, from estimate ``(n, N)`` and command."""
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
 
     def readings_of(self, state: Array) -> Array:

@@ -1,9 +1,9 @@
 """Scenarios of UavAutopilot: the paper's two inputs, the training distribution, and four held-out tests.
 
-Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16
-(plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of
-``paper-noise`` stops before the end: in the last measurements control costs without a later benefit, so that a policy
-with the time as input can be better there than the filter, which is optimal for an infinite horizon.
+Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16 (plant P)
+and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of ``paper-noise`` stops
+before the end: the filter is optimal for an infinite horizon, and in the last measurements control costs without a
+later benefit.
 """
 
 from collections.abc import Mapping

@@ -37,14 +37,12 @@ from .world import AircraftWorld, Measurement, Start
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported here, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the control that the autopilot computes from the estimate, by name."""
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 

@@ -21,7 +21,7 @@ to be finite."""
 
 
 class Truth(NamedTuple):
-    """The true state of the aircraft, its noise levels and commands."""
+    """True state of the aircraft, of noise levels and commands."""
 
     number: Array
     """Number of measurements so far, ``(N,)``."""
@@ -42,7 +42,7 @@ class Truth(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The initial estimate given to every filter."""
+    """Initial estimate given to every filter, with the first command."""
 
     mean: Array
     """Mean, zero, ``(n, N)``."""
@@ -110,14 +110,14 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.task.constant(self.parameters.value("sensor_sigmas"))[:, None] + 0.0 * measurement.reading
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Return the drawn truth (noise levels, commands, disturbances, initial state) and the initial estimate."""
+        """Draw noise levels, commands, disturbances and initial state; return this truth, and the initial estimate."""
         xp, p, size = self.xp, self.parameters, len(self.task.components)
         state = self.initial_sigmas * normals[:size]
         zero = xp.zeros_like(state[0])
         commands = self._commands(draws, zero)
         levels = draw_steps(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
         states = self.disturbances.begin(draws, normals[size:], zero)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         calm = draw_undisturbed(draws, p)
         if calm is not None:
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
@@ -137,10 +137,9 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return truth, Start(xp.zeros_like(state), covariance, zero)
 
     def _commands(self, draws: Draws, zero: Array) -> StepSignal:
-        """Return the drawn command signal, a step or random manoeuvres.
+        """Draw the command signal: a step, or random manoeuvres.
 
-        Each period of random manoeuvres has, at a random time, a step to a new level or a doublet about the present
-        one, with equal probability.
+        Each period of random manoeuvres has a step to a new level or a doublet, with equal probability.
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
@@ -163,13 +162,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return StepSignal(xp.stack(values), xp.stack(times)[1:])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
-        """Return the truth after one interval under the control that is fed back, and the measurement.
-
-        Args:
-            truth: truth at the previous measurement.
-            noise: ``(normals, N)``.
-            feedback: the control u, ``(N,)``.
-        """
+        """Return the truth after one interval under the control that is fed back, and the measurement."""
         xp = self.xp
         number = truth.number + 1.0
         level = truth.levels.at(number, xp)
@@ -210,7 +203,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the weighted squares of the deviation from the command's equilibrium and of the control, ``(N,)``."""
+        """Return the loop's cost, a weighted sum of squared control and distance to the commanded state, ``(N,)``."""
         task = self.task
         control = task.autopilot(mean, truth.command)
         total = task.design.control_weight * control * control
@@ -220,12 +213,11 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return total * (1.0 / task.cost_unit)
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the loss of the control from an estimate against the optimal control from the true state, ``(N,)``.
+        """Return the loss of an estimate's control against the optimal control from the true state, ``(N,)``.
 
         ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters
         the sums over an episode differ on average by the difference of their costs, including the value ``x^T S x`` of
-        their final states. The loss excludes the costs of noise and command under any control and their variance, so
-        that the effect of an action is visible sooner.
+        their final states. It excludes the costs of noise and command under any control.
         """
         if self.optimal is None:
             return self.cost(truth, mean)
@@ -237,7 +229,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: output and command."""
+        """Return output and command to record at a measurement, by name."""
         return {
             **self.disturbances.records(truth.disturbances),
             "output": truth.state[self.task.output],
@@ -245,7 +237,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context by name: noise levels, commands, dropouts with their times, and sensor errors."""
+        """Return noise levels, commands, dropouts with their times, and sensor errors, by name."""
         return {
             "levels": truth.levels.values,
             "level_times": truth.levels.times,

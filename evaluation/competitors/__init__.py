@@ -1,5 +1,5 @@
 """Competitors: policies, estimators, smoothers, references and bounds, and their adapters to filters in the loop.
 
-It imports ``storage`` and ``statistics`` and does not run episodes. Begin with :mod:`.kinds`; :mod:`.filters` adapts
-each kind to the loop, :mod:`.online` and :mod:`.stepping` process one measurement at a time.
+It does not run episodes. Begin with :mod:`.kinds`; :mod:`.filters` adapts each kind to the loop,
+:mod:`.online` and :mod:`.stepping` process one measurement at a time.
 """

@@ -1,7 +1,7 @@
 """Adapters that run an estimator of a single track for many episodes in parallel.
 
-There is one estimator object for each episode, and each is updated in turn, which is slow. An estimator in a separate
-process can also import this module (:data:`.isolation.SHARED`), so it imports nothing else of the package.
+One estimator object for each episode is updated in turn, which is slow. An estimator in a separate process
+can also import this module (:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
 import inspect
@@ -32,7 +32,7 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
 
 
 def takes_problem(maker: Any) -> bool:
-    """Return whether a maker's first argument is the task or model: it has no default, or that name."""
+    """Return whether a maker takes the task or model: a first argument without default, or so named."""
     try:
         first = next(iter(inspect.signature(maker).parameters.values()), None)
     except ValueError:  # for a compiled class
@@ -66,11 +66,8 @@ def check_update_order(estimator: Any) -> None:
 class SingleTrackEstimator(ABC):
     """Base class of estimators of a single track; it runs one track object for each episode.
 
-    Subclasses define :meth:`begin`, :meth:`step` and :meth:`estimate`. They may change a track in
-    place. Those with random numbers must seed them for each track, so that an episode does not depend on the others.
-
-    Args:
-        task: stored as ``self.task``; ``task.parameters`` contains every constant.
+    Subclasses define :meth:`begin`, :meth:`step` and :meth:`estimate`. They may change a track in place, and
+    must seed random numbers for each track.
 
     Raises:
         ValueError: if ``state`` lacks a component of the task.
@@ -96,7 +93,7 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def begin(self, initial: Any) -> Any:
-        """Return an object for a new track, such as a filter, set to the initial estimate.
+        """Return a track object, such as a filter, at the initial estimate of one track.
 
         Args:
             initial: initial estimate of the track, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
@@ -117,16 +114,14 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return the mean, n numbers, and the covariance, ``(n, n)``, of a track's ``state``."""
+        """Return mean ``(n,)`` and covariance ``(n, n)`` of a track, in the order of ``state``."""
 
     def reading(self, measurement: Any) -> tuple[Array, Array]:
-        """Return the measured vector, ``(m,)`` or None, and its noise covariance, ``(m, m)``.
+        """Return the measured vector, ``(m,)``, or None if it was not received, and its noise covariance,
+        ``(m, m)``.
 
-        It must be a linear function of the state. By default it is the position, for tasks whose measurement has
-        ``position`` and ``variance``; None where it is not ``available``.
-
-        Raises:
-            ValueError: if the measurement lacks these fields.
+        It must be a linear function of the state. By default it is the position, for tasks whose measurement
+        has ``position`` and ``variance``.
         """
         if not hasattr(measurement, "position") or not hasattr(measurement, "variance"):
             raise ValueError(
@@ -137,7 +132,7 @@ class SingleTrackEstimator(ABC):
         return None if missed else measurement.position, numpy.diag(measurement.variance)
 
     def start(self, initial: Any, N: int) -> list[Any]:
-        """Return a list of N new tracks; see :meth:`.Estimator.start`."""
+        """Return a list of N track objects, one for each episode."""
         tracks = []
         for lane in range(N):
             own = select_lanes(initial, lane)
@@ -149,7 +144,9 @@ class SingleTrackEstimator(ABC):
         return tracks
 
     def update(self, memory: list[Any], measurement: Any) -> tuple[Array, Array, list[Any]]:
-        """Update every track; return means ``(C, N)``, covariances ``(C, C, N)`` and the tracks."""
+        """Update every track with its measurement; return means ``(C, N)``, covariances ``(C, C, N)`` and the
+        tracks.
+        """
         tracks, estimates = [], []
         for lane, track in enumerate(memory):
             moved = self.step(track, select_lanes(measurement, lane))
@@ -178,7 +175,7 @@ class FilterpyEstimator(SingleTrackEstimator):
     """
 
     def step(self, track: Any, measurement: Any) -> None:
-        """Predict, and update with the measurement and its covariance; a missing measurement is only predicted."""
+        """Predict a filterpy filter and update it with the measurement, if one was received."""
         z, R = self.reading(measurement)
         self.predict(track, getattr(measurement, "interval", None))
         for model in getattr(track, "filters", [track]):
@@ -210,5 +207,5 @@ class FilterpyEstimator(SingleTrackEstimator):
         track.predict()
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return the mean ``x`` and the covariance ``P`` of a filter."""
+        """Return mean ``x`` and covariance ``P`` of a filterpy filter."""
         return track.x, track.P

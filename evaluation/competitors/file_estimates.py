@@ -1,8 +1,8 @@
 """Estimates in a file as a competitor: those of another program on the same measurements.
 
-A row of the file belongs to a measurement by its track and its time. A measurement without a row has the estimate of
-the last row before it, and counts as missing; before the first row the initial estimate applies. Soon after the last
-row of a track the episode is lost.
+A row of the file belongs to a measurement by its track and its time. A measurement without a row counts as
+missing and has the estimate of the last row, or the initial one. Soon after a track's last row the episode is
+lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,11 +34,7 @@ SHOWN = 5
 
 
 class FileEstimates:
-    """Maker of a competitor from a file of estimates, see :mod:`..storage.estimate_tables`.
-
-    Args:
-        path: path of the file.
-    """
+    """Maker of a competitor from a file of estimates, see :mod:`..storage.estimate_tables`."""
 
     kind = "estimator"
 
@@ -53,8 +49,7 @@ class FileEstimates:
             tracks: name of each track, by the seed of its episode.
 
         Raises:
-            ValueError: if it cannot be read, has other tracks or another clock, or lacks components that the cost
-                needs.
+            ValueError: for a file that cannot be read, or does not match the evaluation.
         """
         name = str(self.path)
         table = read_estimates(self.path, [component.name for component in task.components])
@@ -83,19 +78,12 @@ class TrackEstimates(NamedTuple):
     kind: str = "estimator"
 
     def of_episodes(self, task: Task, seeds: Sequence[int]) -> "FileTrack":
-        """Return a filter that returns the file's estimates, for the episodes with these seeds."""
+        """Return a filter whose estimates are the file's rows, for the episodes with these seeds."""
         return FileTrack(task, self, [self.tracks[seed] for seed in seeds])
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Return the times of a recording's measurements by track, s by the clock of the estimates; None in a simulation.
-
-    Seconds may count from the first measurement of the log, or be those of the log: the clock with which most
-    measurements have a row applies.
-
-    Raises:
-        ValueError: if the estimates are of another clock, or fewer than half of the measurements have a row.
-    """
+    """Return a recording's measurement times by track, s by the estimates' clock; None in a simulation."""
     import pandas
 
     recording = task.recording
@@ -125,7 +113,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
             clocks = dict(reversed(clocks.items()))
     elif log_clock != table.clock:
         raise ValueError(f"the times of {name} are {table.clock}, and those of the log {log_clock}")
-    tolerance = _tolerance(task)
+    tolerance = _time_tolerance(task)
     shares = {which: _share_found(table, times, tolerance) for which, times in clocks.items()}
     best = max(shares, key=lambda which: shares[which])
     if shares[best] < LEAST_SHARE:
@@ -138,8 +126,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
     return clocks[best]
 
 
-def _tolerance(task: Task) -> float:
-    """Return the largest permitted difference of the times of a row and its measurement, s."""
+def _time_tolerance(task: Task) -> float:
     return min(SAME_TIME, 0.25 * _usual_interval(task))
 
 
@@ -148,10 +135,7 @@ def _usual_interval(task: Task) -> float:
 
 
 def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
-    """Raise ValueError if most rows are outside the times of a simulated episode.
-
-    Its intervals are at most twice the usual one.
-    """
+    """Raise ValueError if most times of the file are not within twice the length of a simulated episode."""
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
         raise ValueError(
@@ -166,7 +150,7 @@ def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
 
 
 def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
-    """Return the share of the measurements of all tracks that have a row of the file."""
+    """Return the share of a recording's measurements that have a row of the file."""
     found = total = 0
     for track, time in times.items():
         rows = numpy.sort(table.time if {*table.track} == {""} else table.time[table.track == track])
@@ -193,13 +177,7 @@ class FileState(NamedTuple):
 
 
 class FileTrack(Filter[Task, Any, FileState]):
-    """Filter whose estimates are the rows of a file.
-
-    Args:
-        task: the estimation problem.
-        estimates: estimates of the file.
-        names: name of the track of each episode.
-    """
+    """Filter whose estimates are the rows of a file; ``names`` are the tracks of its episodes."""
 
     in_python = True
 
@@ -223,16 +201,18 @@ class FileTrack(Filter[Task, Any, FileState]):
             self._last.append(table.time[rows[-1]] if len(rows) else -numpy.inf)
         self._order, self._keys = numpy.concatenate(order), numpy.concatenate(keys)
         self._first = numpy.cumsum([0, *map(len, order)])[:-1]
-        self._interval, self._tolerance = _usual_interval(task), _tolerance(task)
+        self._interval, self._tolerance = _usual_interval(task), _time_tolerance(task)
 
     def start(self, initial: Any) -> FileState:
-        """Return the state before the first row."""
+        """Return the state before the first row of the file."""
         width = initial.mean.shape[-1]
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
     def update(self, state: FileState, inputs: FilterInput) -> FileState:
-        """Return the state with each episode's newest row that is not later than the measurement."""
+        """Select each episode's newest row of the file that is not later than the measurement; return the
+        state.
+        """
         width = inputs.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
         seconds = self._times(state, inputs.measurement)
@@ -245,7 +225,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
 
     def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
-        """Return the times of the measurements in the episodes, s by the clock of the file, ``(N,)``."""
+        """Return the time of each episode's measurement, s by the clock of the file, ``(N,)``."""
         width = measurement[0].shape[-1]
         if self.estimates.times is None:
             interval = getattr(measurement, "interval", None)
@@ -260,19 +240,21 @@ class FileTrack(Filter[Task, Any, FileState]):
         return numpy.array(now)[numpy.minimum(numpy.arange(width), len(now) - 1)]
 
     def mean(self, state: FileState) -> Array:
-        """Return the mean in the present row, ``(C, N)``; before the first row the initial one."""
+        """Return the mean in the selected row, ``(C, N)``; before the first row the initial one."""
         unknown = ~numpy.array(self.estimates.table.known)[:, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.mean)
         return numpy.where(state.row >= 0, self.estimates.table.mean[:, state.row], initial)
 
     def covariance(self, state: FileState) -> Array:
-        """Return the covariance in the present row, ``(C, C, N)``; NaN where the file contains none."""
+        """Return the covariance in the selected row, ``(C, C, N)``; NaN where the file contains none."""
         unknown = ~numpy.logical_and.outer(*2 * [self.estimates.table.deviations])[:, :, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.covariance)
         return numpy.where(state.row >= 0, self.estimates.table.covariance[..., state.row], initial)
 
     def records(self, state: FileState, measurement: Any) -> dict[str, Array]:
-        """Return the likelihood statistics of the row by name, and whether it is missing or the track has ended."""
+        """Return the row's likelihood statistics by name, and whether the row is missing or the track has
+        ended.
+        """
         numbers = {
             name: numpy.where(state.missing > 0.0, numpy.nan, values[state.row])
             for name, values in self.estimates.table.likelihood.items()

@@ -1,8 +1,7 @@
 """Adapters that run an estimator, a reference or a bound as the filter of a model.
 
-Shipped estimators are filters. :func:`as_filter` makes a filter from a user's estimator. It is compiled like a bank if
-it is declared ``traceable``. Other estimators run as Python code between compiled steps of the world, and their
-memory may be any object.
+:func:`as_filter` makes a filter from a user's estimator. It is compiled like a bank if it is declared
+``traceable``, otherwise it runs as Python code between compiled steps of the world.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,12 +42,7 @@ class AdaptedState(NamedTuple):
 
 
 class Adapter(Filter[Task, Any, AdaptedState]):
-    """Filter that calls a user's estimator, see :class:`.kinds.Estimator`.
-
-    Args:
-        task: the estimation problem.
-        estimator: the estimator, made for the task.
-    """
+    """Filter that calls a user's estimator, see :class:`.kinds.Estimator`."""
 
     def __init__(self, task: Task, estimator: Any) -> None:
         super().__init__(task)
@@ -58,15 +52,15 @@ class Adapter(Filter[Task, Any, AdaptedState]):
         """Whether the estimator has ever returned a log-likelihood."""
 
     def start(self, initial: Any) -> AdaptedState:
-        """Start the estimator with the initial estimate; return the state."""
+        """Start the estimator; return the filter's state with the initial estimate."""
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def first(self, initial: Any, memory: Any) -> AdaptedState:
-        """Return the filter's state before the first measurement, with the initial estimate and a memory."""
+        """Return the filter's state before the first measurement, with the estimator's memory."""
         return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
-        """Call the estimator's ``update`` with the measurement; return the state with its estimate."""
+        """Update the estimator with the measurement; return the filter's state with its estimate."""
         answer = self.call_update(inputs, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
             count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
@@ -83,15 +77,15 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 
     @property
     def fault(self) -> int:
-        """Number among ``FAULTS`` of the reason why the program returned no estimate; 0 without a fault."""
+        """Number among ``FAULTS`` of the reason why a program returned no estimate; 0 without a fault."""
         return getattr(self.own, "fault", 0)
 
     def call_update(self, inputs: FilterInput, memory: Any) -> Any:
-        """Return the result of the estimator's ``update``: mean, covariance, memory, and optionally likelihood."""
+        """Call the estimator's ``update``; return mean, covariance, memory, and optionally the likelihood."""
         return self.own.update(memory, inputs.measurement)
 
     def smooth(self, measurements: Sequence[Any], states: Sequence[AdaptedState]) -> tuple[Array, Array]:
-        """Return the smoothed means ``(C, K, N)`` and covariances ``(C, C, K, N)``, from the smoother's ``smooth``."""
+        """Return a smoother's means ``(C, K, N)`` and covariances ``(C, C, K, N)`` at all K measurements."""
         answer: tuple[Array, Array] = self.own.smooth(measurements, [state.memory for state in states])
         return answer
 
@@ -104,11 +98,11 @@ class ReferenceAdapter(Adapter):
         self.knows: str = getattr(reference, "knows", "") or "the truth"
 
     def initialise(self, inputs: FilterInput) -> AdaptedState:
-        """Start the reference with the initial estimate and the truth; return the state."""
+        """Start the reference with the initial estimate and the truth; return the filter's state."""
         return self.first(inputs.measurement, self.own.start(inputs.measurement, inputs.truth))
 
     def call_update(self, inputs: FilterInput, memory: Any) -> Any:
-        """Return the result of the reference's ``update``, called with the truth."""
+        """Call the reference's ``update`` with measurement and truth; return its result."""
         return self.own.update(memory, inputs.measurement, inputs.truth)
 
 
@@ -116,17 +110,19 @@ class BoundAdapter(ReferenceAdapter):
     """Filter that calls a user's bound; its mean is the limit of the mean square error, see :class:`.kinds.Bound`."""
 
     def first(self, initial: Any, memory: Any) -> AdaptedState:
-        """Return the state before the first measurement, with a limit of zero."""
+        """Return the state before the first measurement, with a bound of zero on the mean square error."""
         return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
     def call_update(self, inputs: FilterInput, memory: Any) -> Any:
-        """Return the bound's limit, None in place of a covariance, and its memory."""
+        """Call the bound's ``update``; return its mean square error, None in place of a covariance, and its
+        memory.
+        """
         limit, memory = super().call_update(inputs, memory)
         return limit, None, memory
 
 
 def as_filter(task: Task, competitor: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
-    """Return a filter that calls a user's estimator, reference or bound; a filter is returned unchanged."""
+    """Return a filter that runs a user's estimator, reference or bound; a filter is returned unchanged."""
     if isinstance(competitor, Filter):
         return competitor
     adapters = {"reference": ReferenceAdapter, "bound": BoundAdapter}
@@ -134,13 +130,14 @@ def as_filter(task: Task, competitor: Any, kind: Kind = "estimator") -> Filter[A
 
 
 class PythonFilter(Filter[Task, Any, AdaptedState]):
-    """Wrapper of a filter that runs in Python: it stores the filter's state and checks its estimates.
+    """Wrapper of a filter that runs in Python: it stores that filter's state and checks the shape of its
+    estimates.
 
     Args:
-        task: the estimation problem.
         wrapped: the filter; None while the steps of the world are traced.
         name: kind and name of the competitor, for error messages.
-        count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they are.
+        count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they
+            are.
         stated: components that the filter reports, where ``wrapped`` is None.
     """
 
@@ -171,7 +168,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, inputs: FilterInput) -> FilterInput:
-        """Return the inputs with the last episode repeated in further lanes, as copies that may be changed."""
+        """Return the inputs with the last episode repeated in padding lanes, as copies."""
         if self.count is None:
             return inputs
         width = inputs.measurement[0].shape[-1]
@@ -179,22 +176,18 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return inputs._replace(measurement=select_lanes(inputs.measurement, lanes))
 
     def initialise(self, inputs: FilterInput) -> AdaptedState:
-        """Start the wrapped filter with the initial estimate; return a state without its memory, stored here."""
+        """Start the wrapped filter, with the truth where it may use it; return the first state."""
         with explain_errors(f"{self.name} failed at the start of the track"):
             self.memory = self.own.initialise(self._repeat_last(inputs))
         initial = inputs.measurement
         return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
     def start(self, initial: Any) -> AdaptedState:
-        """Start the wrapped filter with the initial estimate, without the truth; return the state."""
+        """Start the wrapped filter without the truth; return the first state."""
         return self.initialise(FilterInput(initial))
 
     def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
-        """Update the wrapped filter with a measurement; return the state with its checked estimate.
-
-        Raises:
-            ValueError: if its estimate is no array of the required shape.
-        """
+        """Update the wrapped filter; return the state with its estimate, checked for shape and type."""
         self.step_number += 1
         inputs = self._repeat_last(inputs)
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
@@ -216,12 +209,12 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return AdaptedState(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
     def feedback(self, state: AdaptedState, measurement: Any) -> Array | None:
-        """Return the feedback to the world that a program has written; None for any other filter."""
+        """Return the feedback that a program has written for the simulated world; None for other filters."""
         own: Any = self.own.own if isinstance(self.own, Adapter) else None
         return own.feedback if is_program(own) else None
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
-        """Return an array of the estimate as float64; raise ValueError if it has another shape or type."""
+        """Return mean or covariance (``word``) as float64 array; raise ValueError for another shape or type."""
         where = f"{self.name}: the {word} at measurement {self.step_number}"
         try:
             given = numpy.asanyarray(values)
@@ -242,7 +235,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
 
 
 class Checked(NamedTuple):
-    """State of a :class:`CheckedFilter`."""
+    """State of a :class:`CheckedFilter`: state of the wrapped filter, last valid estimate, and fault."""
 
     own: Any
     """State of the filter."""
@@ -263,9 +256,8 @@ class Checked(NamedTuple):
 class CheckedFilter(Filter[Task, Any, Checked]):
     """Wrapper of a competing filter: it masks missing measurements and checks the estimates.
 
-    An episode in which an estimate is not finite, or its covariance is invalid, is lost from that measurement on: the
-    last valid estimate, or else the initial one, is repeated to the end. Any estimator could return that estimate
-    itself, so losing an episode is no advantage.
+    An episode with an invalid estimate or covariance is lost from that measurement on: the last valid
+    estimate, or else the initial one, is repeated to the end. Losing an episode is no advantage.
     """
 
     def __init__(self, task: Task, wrapped: Filter[Any, Any, Any]) -> None:
@@ -281,11 +273,13 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero, missing)
 
     def predict(self, state: Checked, measurement: Any) -> Checked:
-        """Return the state with the filter predicted to the time of the measurement."""
+        """Predict the filter to the time of the measurement; return the state."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
     def update(self, state: Checked, inputs: FilterInput) -> Checked:
-        """Update the filter with the masked measurement and check its estimate; return the state."""
+        """Update the filter with the masked measurement; return the state, with the last valid estimate once it
+        is lost.
+        """
         received = self.task.world.mask_missing(inputs.measurement)
         own = self.own.update(state.own, FilterInput(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
@@ -296,11 +290,13 @@ class CheckedFilter(Filter[Task, Any, Checked]):
             missing = self.own.extra.get("missing")
         fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
-        mean = self._held(lost, state.mean, mean)
-        return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
+        mean = self._repeat_last_valid(lost, state.mean, mean)
+        return Checked(
+            own, mean, self._repeat_last_valid(lost, state.covariance, covariance), fault, missed, missing
+        )
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return mean and covariance with valid numbers for the components that the filter never reports."""
+        """Fill components that the filter never reports: mean 0, covariance of the identity."""
         if self.stated is None:
             return mean, covariance
         known, deviations = map(numpy.array, self.stated)
@@ -308,15 +304,19 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         apart = numpy.eye(len(known))[:, :, None]
         return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
-    def _held(self, lost: Array, last: Array, estimate: Array) -> Array:
-        """Return the estimate, replaced by the last valid one where the episode is lost."""
+    def _repeat_last_valid(self, lost: Array, last: Array, estimate: Array) -> Array:
+        """Replace an estimate by the last valid one where the episode is lost; in place for filters in
+        Python.
+        """
         if self.in_python:  # a copy retains its layout, on which rounding in matrix products depends
             estimate[..., lost] = last[..., lost]
             return estimate
         return self.xp.where(lost, last, estimate)
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
-        """Return a program's feedback; where it is not finite or the episode is lost, that of the estimate."""
+        """Return a program's feedback to the world, or that of the estimate where it is invalid; None without a
+        program.
+        """
         own = self.own.feedback(state.own, measurement) if isinstance(self.own, PythonFilter) else None
         if own is None:
             return None
@@ -324,7 +324,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return numpy.where(usable, own, self.task.feedback(state.mean, state.covariance, measurement))
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
-        """Return the likelihood statistics of the measurement by name, and the number of the reason for a loss."""
+        """Return likelihood statistics of the measurement by name, and as ``lost`` the number of the fault."""
         likelihood = Likelihood.of_records(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
         return {**likelihood._asdict(), "lost": state.fault, **missing}
@@ -341,14 +341,13 @@ def is_lacking(received: Any, xp: Any) -> Array:
 
 
 def find_fault(mean: Array, covariance: Array, earlier_fault: Array, any_missing: Array, xp: Any) -> Array:
-    """Return the number of the fault of each estimate, ``(N,)``: not finite, not symmetric, not positive definite.
-
-    An earlier fault has priority.
+    """Return the number of each estimate's fault, ``(N,)``: not finite, not symmetric or not positive
+    definite.
 
     Args:
         mean: means, ``(C, N)``.
         covariance: covariances, ``(C, C, N)``.
-        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; zero where it was not.
+        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; or zero.
         any_missing: above zero where a measurement was missing so far, ``(N,)``.
         xp: array namespace.
 
@@ -385,19 +384,19 @@ class AroundBank(Filter[Task, Any, State]):
     bank: Any
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Return the state with the bank predicted to the time of the measurement."""
+        """Predict the bank to the time of the measurement; return the state."""
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
     def mean(self, state: Any) -> Array:
-        """Return the mean of the bank's estimate, ``(C, N)``."""
+        """Return the mean of the bank, ``(C, N)``."""
         return self.bank.mean(state.bank)
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the bank's estimate, ``(C, C, N)``."""
+        """Return the covariance of the bank, ``(C, C, N)``."""
         return self.bank.covariance(state.bank)
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """Return the bank's feedback to the world."""
+        """Return the bank's feedback to the simulated world."""
         return self.bank.feedback(state.bank, measurement)
 
 
@@ -411,13 +410,7 @@ class LimitState(NamedTuple):
 
 
 class BoundFilter(AroundBank[LimitState]):
-    """Filter that computes a bound while a bank with the action zero closes the loop.
-
-    Args:
-        task: the estimation problem.
-        bound: the bound as a filter.
-        bank: the bank whose estimate closes the loop.
-    """
+    """Filter that computes a bound while a bank with the action zero closes the loop."""
 
     def __init__(self, task: Task, bound: Filter[Any, Any, Any], bank: Any) -> None:
         super().__init__(task)
@@ -427,15 +420,15 @@ class BoundFilter(AroundBank[LimitState]):
         self.knows: str = bound.knows or "the truth"
 
     def initialise(self, inputs: FilterInput) -> LimitState:
-        """Return the state at the start of bank and bound; the bound receives the truth."""
+        """Start the bank, and the bound with the truth; return the state."""
         return LimitState(self.bank.start(inputs.measurement), self.own.initialise(inputs))
 
     def start(self, initial: Any) -> LimitState:
-        """Return the state at the start of bank and bound, without the truth."""
+        """Start bank and bound without the truth; return the state."""
         return self.initialise(FilterInput(initial))
 
     def update(self, state: LimitState, inputs: FilterInput) -> LimitState:
-        """Update the bank with the action zero, and the bound; return the state."""
+        """Update the bank with the action zero and the bound with the truth; return the state."""
         own = self.own.update(state.own, inputs)
         space, N = self.bank.action_space, self.own.mean(own).shape[-1]
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
@@ -443,14 +436,16 @@ class BoundFilter(AroundBank[LimitState]):
         return LimitState(self.bank.act(state.bank, inputs.measurement, neutral), own)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
-        """Return the limit of the mean square error, ``(C, N)``, as ``mean_square``."""
+        """Return the bound on the mean square error by component, ``(C, N)``, as ``mean_square``."""
         return {"mean_square": self.own.mean(state.own)}
 
 
 def wrap_for_loop(
     kind: Kind, model: Model, competitor_filter: Filter[Any, Any, Any]
 ) -> Filter[Any, Any, Any]:
-    """Return an estimator's filter with checks, a bound's with a bank that closes the loop, a reference's unchanged."""
+    """Wrap an estimator's filter with checks, a bound's with a bank that closes the loop; return a reference's
+    unchanged.
+    """
     if kind == "bound":
         return BoundFilter(model.task, competitor_filter, model.filter)
     return CheckedFilter(model.task, competitor_filter) if kind in TRUTH_FREE_KINDS else competitor_filter
@@ -458,7 +453,7 @@ def wrap_for_loop(
 
 @dataclass(frozen=True)
 class _Maker:
-    """Function that makes a competitor's filter for a model; equal makers are traced once."""
+    """Function that makes a competitor's filter for a model; hashable, so that equal makers are traced once."""
 
     kind: Kind
     maker: Any
@@ -467,7 +462,6 @@ class _Maker:
     """Components that a competitor in Python reports."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
-        """Return the competitor's filter for a model on arrays of any kind."""
         task = model.task
         own = (
             PythonFilter(task, stated=self.stated)
@@ -490,14 +484,7 @@ def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
 def check_knowledge(name: str, competitor: Any, kind: Kind, task: Task) -> None:
     """Raise ValueError unless a reference or bound lists every disturbance of the world in ``disturbances``.
 
-    Args:
-        name: its name, for error messages.
-        competitor: reference or bound, see :class:`.kinds.Reference`.
-        kind: its kind.
-        task: task of the world.
-
-    Raises:
-        ValueError: if one is missing: a new disturbance could make it worse than estimators without that knowledge.
+    An unknown disturbance could make it worse than estimators.
     """
     known = getattr(competitor, "disturbances", ())
     for part in task.world.disturbances.parts if known is not None else ():
@@ -522,7 +509,7 @@ def close_loop(
         last: number of the last measurement of the episodes; None: unknown.
 
     Raises:
-        ValueError: if it cannot be made, lacks a method of its kind, or is a reference that does not declare every
+        ValueError: if it cannot be made, lacks a method, or is a reference that does not declare every
             disturbance.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):

@@ -1,9 +1,8 @@
 """Script of a sandboxed process, which runs a program or a Python estimator.
 
-:mod:`.program_process` starts this file with the interpreter's ``-I -S``, the limit of memory in bytes, and the words
-of a program (docs/programs.md). The program is executed in a PID namespace: it sees no other process, and all its
-processes end with the first. On a system without such namespaces this process adopts the remaining processes and ends
-them.
+:mod:`.program_process` starts this file with the interpreter's ``-I -S``, the limit of memory in bytes, and
+the words of a program (docs/programs.md). The program is executed in a PID namespace: all its processes end
+with the first. On a system without such namespaces this process adopts the remaining processes and ends them.
 
 Without words it runs an estimator. Its first line of input is a request in JSON: the source text of the estimator, or
 its file; the folders of libraries; and the paths that may be read. Then comes the hello. The only part of the package
@@ -68,11 +67,8 @@ FORBIDDEN, MISSING, PERMITTED = 0x50001, 0x50026, 0x7FFF0000
 
 
 def enter_namespaces(libc: Any, wanted: int) -> bool:
-    """Move this process into new namespaces; return whether the system permits it.
-
-    A process without the privilege enters a namespace of users first.
-
-    Its first child is the first process in the namespace of processes.
+    """Move this process (of the process ids its children) into new Linux namespaces; return whether it is
+    permitted.
     """
     user, group = os.getuid(), os.getgid()
     if libc.unshare(wanted) == 0:
@@ -93,9 +89,8 @@ def enter_namespaces(libc: Any, wanted: int) -> bool:
 
 
 def continue_in_child(libc: Any, apart: bool) -> None:
-    """Fork and continue in the child; the parent waits for it and exits with its status.
-
-    The parent ends its other children before.
+    """Fork and continue in the child; the parent waits, ends its other children and exits with the child's
+    status.
     """
     libc.prctl(ADOPT, 1, 0, 0, 0)
     if (child := os.fork()) == 0:
@@ -122,7 +117,7 @@ def continue_in_child(libc: Any, apart: bool) -> None:
 
 
 def limit_resource(name: str, most: int) -> None:
-    """Set the limit of a resource of this process, unless it is lower already."""
+    """Lower the limit of a resource of this process to ``most``, unless it is lower already."""
     import resource
 
     kind = getattr(resource, name)
@@ -156,14 +151,7 @@ def landlock_version() -> int:
 
 
 def restrict_files(libc: Any, version: int, readable: list[str], listable: list[str]) -> None:
-    """Restrict this process by Landlock to reading some files and writing no file.
-
-    Args:
-        libc: the C library.
-        version: version of Landlock.
-        readable: files and folders that may be read, with all below them.
-        listable: folders whose lists of names may be read, with those of all folders below them.
-    """
+    """Restrict this process by Landlock: it may read ``readable``, list ``listable``, and write no file."""
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
@@ -222,12 +210,8 @@ def filter_calls(libc: Any) -> bool:
 
 
 def restrict_process(readable: list[str], listable: list[str], apart: bool) -> str:
-    """Restrict this process permanently; return a sentence on the remaining gaps, empty if there are none.
-
-    Args:
-        readable: files and folders that may be read, with all below them.
-        listable: folders whose lists of names may be read, with those of all folders below them.
-        apart: whether the process is in its own namespaces.
+    """Restrict this process's files and system calls for good; return a sentence on remaining gaps, or empty
+    text.
     """
     version, filtered = landlock_version(), False
     if sys.platform == "linux":
@@ -254,11 +238,7 @@ def restrict_process(readable: list[str], listable: list[str], apart: bool) -> s
 
 
 class SharedModules:
-    """Finder and loader of modules whose source texts are in the request, and of the packages that contain them.
-
-    Args:
-        texts: source texts by the names of modules.
-    """
+    """Finder and loader of modules whose source texts are in the request, by name, and of their packages."""
 
     def __init__(self, texts: dict[str, str]) -> None:
         from importlib.machinery import ModuleSpec
@@ -272,16 +252,16 @@ class SharedModules:
         return self.new(name, self, is_package=around) if around or name in self.texts else None
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Return None, so that Python makes the module."""
+        """Return None: Python makes the module object."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """Execute the source text of a module; that of a package is empty."""
+        """Execute the source text of a module, which is empty for a package."""
         name = module.__name__
         exec(compile(self.texts.get(name, ""), name, "exec", dont_inherit=True), module.__dict__)
 
 
 def nested_tuple(values: dict[str, Any], name: str) -> Any:
-    """Return a NamedTuple of arrays from a mapping by name; dots in names separate nested NamedTuples."""
+    """Make nested NamedTuples of arrays from a mapping, at the dots in its names."""
     from collections import namedtuple
 
     parts: dict[str, Any] = {}
@@ -309,7 +289,7 @@ class Parameters:
 
 
 def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
-    """Return an object with the task's constants and components, which an estimator receives instead of the task."""
+    """Return the object that an isolated estimator receives as its task: constants, components and groups."""
     from types import SimpleNamespace
 
     parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in hello["parameters"].items()}
@@ -357,7 +337,9 @@ class Frames:
 
 
 def load_estimator(request: dict[str, Any]) -> Any:
-    """Execute the estimator's source text in a request; return the class that the request names."""
+    """Execute the estimator's source text in a request; return its class, checked for the methods of an
+    estimator.
+    """
     from types import ModuleType
 
     module = ModuleType(request["module"])
@@ -373,7 +355,7 @@ def load_estimator(request: dict[str, Any]) -> Any:
 
 
 def make_estimator(cls: Any, task: Any) -> Any:
-    """Return an estimator of a class, made with the task if the constructor takes an argument."""
+    """Return an estimator of a class, made with the task if its constructor takes it."""
     from filtergym.evaluation.competitors.adapters import check_update_order, takes_problem
 
     check_update_order(cls)
@@ -413,7 +395,7 @@ def main(memory: str, *words: str) -> None:
 
 
 def serve_estimator(apart: bool) -> None:
-    """Run one estimator: read measurements from standard input, and write estimates to standard output."""
+    """Serve one estimator in this restricted process over standard input and output."""
     import json
 
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")

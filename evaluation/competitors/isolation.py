@@ -63,16 +63,9 @@ def isolate_estimator(name: str) -> Program:
 
 
 def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
-    """Return a program that runs the estimator class of a source text in a sandboxed process.
-
-    Args:
-        text: source text of its module.
-        attribute: name of its class.
-        name: name of the competitor, for error messages.
-        file: file of the text, if there is one; the process can read its folder.
-    """
+    """Return a program that runs an estimator class, given as source text, in a sandboxed process."""
     folder = [] if file is None else [str(file.parent.absolute())]
-    libraries = _libraries()
+    libraries = _library_folders()
     # Some editable installations hold links to files, so the folders of these count, too.
     forbidden = [
         own.resolve() for place in package_folders() for own in (place, (place / INIT).resolve().parent)
@@ -85,7 +78,7 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
         "module": "isolated" if file is None else file.stem,
         "name": attribute,
         "path": [*libraries, *folder],
-        "readable": sorted({path for place in allowed for path in _without(place, forbidden)}),
+        "readable": sorted({path for place in allowed for path in _allowed_paths(place, forbidden)}),
         # An import needs the names in the folder that holds a library; some installations have this package there, too.
         "listable": [*libraries, *folder],
         "shared": _shared_modules(),
@@ -99,8 +92,7 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
     )
 
 
-def _libraries() -> list[str]:
-    """Return the paths of Python's library and of installed packages, in the order of the search."""
+def _library_folders() -> list[str]:
     own = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
     extensions = [str(Path(place) / "lib-dynload") for place in own]
     packages = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
@@ -114,8 +106,8 @@ def _shared_modules() -> dict[str, str]:
     return {spec.name: Path(str(spec.origin)).read_text(encoding="utf-8") for spec in specs if spec}
 
 
-def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
-    """Yield the paths below a folder without forbidden ones; the folder itself if it contains none."""
+def _allowed_paths(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
+    """Yield the paths below a folder, as high as possible, that contain no forbidden path."""
     real = place.resolve()
     if not real.exists() or any(real.is_relative_to(other) for other in forbidden):
         return
@@ -123,9 +115,9 @@ def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
         yield str(real)
         return
     for inner in real.iterdir():
-        yield from _without(inner, forbidden)
+        yield from _allowed_paths(inner, forbidden)
 
 
 def find_isolated(name: str, inner: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor for the name ``isolated:module:Class``."""
+    """Return the competitor named ``isolated:module:Class``, an estimator in a sandboxed process."""
     return Competitor(name, isolate_estimator(inner))

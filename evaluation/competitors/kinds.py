@@ -1,12 +1,10 @@
 """Protocols and base classes of policies, estimators, smoothers, references and bounds.
 
-A **policy** observes and returns actions; learned or classical, it has Stable-Baselines3's method ``predict``. An
-**estimator** receives what a policy's filters receive, the initial estimate and every measurement, and returns mean and
-covariance; it is ranked with the policies, and marked. A **smoother** is an estimator that returns its estimates after
-the last measurement and also uses later ones: it is not causal, and never ranked. A **reference** is an estimator that
-may know what no competitor measures; it is never ranked. A **bound** is computed. The attribute ``kind`` gives the
-kind; an object without it is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of
-Stable-Baselines3.
+A **policy** has Stable-Baselines3's method ``predict``. An **estimator** receives the initial estimate and
+every measurement, and returns mean and covariance; it is ranked with the policies. A **smoother** is an
+estimator that also uses later measurements, a **reference** one that may use the truth; neither is ranked. A
+**bound** is computed. The attribute ``kind`` gives the kind; an object without it is an estimator if it has
+``start`` and ``update``, otherwise a policy, such as a model of Stable-Baselines3.
 """
 
 import functools
@@ -48,7 +46,7 @@ class Competitor(NamedTuple):
 
 
 class CompetitorFiles(NamedTuple):
-    """Functions that find and load competitors from files and folders."""
+    """Functions by which competitors are found and loaded from files and folders."""
 
     find: Callable[[str, Any, bool, Callable[[str, str], Competitor]], Competitor | None]
     """Function that returns the competitor of a name in a problem, or None. Its other arguments: whether files that
@@ -72,7 +70,7 @@ def kind_of(competitor: Any) -> Kind:
 
 
 def is_filter(competitor: Any) -> bool:
-    """Return whether a competitor is a :class:`.Filter`, or its maker makes one."""
+    """Return whether a competitor, or the class that makes it, is a :class:`.Filter`."""
     made = getattr(competitor, "func", competitor)
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
@@ -87,7 +85,7 @@ def _has(found: Any, *methods: str) -> bool:
 
 
 def make_competitor(maker: Any, problem: Task | Model) -> Any:
-    """Return the competitor that a maker makes for a problem; an object that is no maker is returned unchanged.
+    """Make a competitor for a problem; an object that is no maker is returned unchanged.
 
     Args:
         maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first
@@ -100,12 +98,12 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
 
 
 def is_made_for_episodes(competitor: Any) -> bool:
-    """Return whether a competitor, such as a file of estimates, has ``of_episodes(task, seeds)``."""
+    """Return whether a competitor is made for given episodes: it has ``of_episodes(task, seeds)``."""
     return _has(competitor, "of_episodes")
 
 
 def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> Any:
-    """Return a user's competitor unchanged, after a check that it has the methods of its kind.
+    """Return a competitor unchanged, or raise ValueError if it lacks a method of its kind.
 
     Args:
         name: its name in the table of results.
@@ -113,8 +111,7 @@ def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> An
         kind: required kind; default: its own.
 
     Raises:
-        ValueError: if it lacks a method of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
-            smoother; or if its ``update`` takes the memory after the measurement.
+        ValueError: for a missing method, or an ``update`` that takes the memory after the measurement.
     """
     kind = kind or kind_of(competitor)
     methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
@@ -133,13 +130,7 @@ def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> An
 
 
 def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
-    """Copy the spaces of an inner model to the policy that wraps it.
-
-    Args:
-        outer: the policy.
-        inner: the model that it calls, for example one of Stable-Baselines3.
-        further: other attributes to copy where the inner model has them.
-    """
+    """Copy the inner model's spaces, and its attributes named in ``further``, to ``outer``."""
     for name in ("observation_space", "action_space", *further):
         if hasattr(inner, name):
             setattr(outer, name, getattr(inner, name))
@@ -148,8 +139,7 @@ def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
 class Policy:
     """Base class of classical policies; observations and actions are ``(N, ...)``, batch first, as in Gymnasium.
 
-    A policy is made for a model, and deterministic unless documented otherwise. Filters have the batch last; where a
-    policy acts inside a filter, :mod:`.steered_filter` transposes the axes.
+    A policy is made for a model, and deterministic unless documented otherwise.
 
     Subclasses set ``control`` and define :meth:`act`. A policy with memory takes and returns it as ``state``, so that
     one object serves any number of episodes.
@@ -168,7 +158,7 @@ class Policy:
         self.task: Any = model.task
 
     def begin(self, seeds: Sequence[int]) -> Any:
-        """Return the policy's memory at the start of episodes; random numbers must be drawn from their seeds."""
+        """Return the policy's memory at the start of episodes; a random policy draws from these seeds."""
         return None
 
     def predict(
@@ -178,16 +168,13 @@ class Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Return the actions for a batch of observations, and the memory for the next call.
+        """Return the actions for a batch of observations, batch first, and the memory for the next call.
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
             state: memory that the last call returned; None at the first call.
             episode_start: mask of new episodes, ``(N,)`` booleans.
             deterministic: as in Stable-Baselines3; classical policies ignore it.
-
-        Returns:
-            Actions, batch first, and the memory for the next call.
         """
         single = observation.ndim == 1
         batch = observation[None] if single else observation
@@ -198,14 +185,15 @@ class Policy:
         return (action[0] if single else action), state
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the actions of a batch and the memory; ``start`` marks the episodes whose memory must be reset."""
+        """Return actions ``(N, ...)`` and memory for observations ``(N, fields)``; ``start`` marks episodes that
+        begin.
+        """
         raise NotImplementedError
 
 
 def compilation_key(maker: Any) -> Any:
-    """Return the key under which a competitor's compiled code is cached.
-
-    It is the maker; for a function, which may make another competitor next time, a new object.
+    """Return the key under which a competitor's compiled code is cached: the maker, or a new object for a
+    function.
     """
     return functools.partial(maker) if isinstance(maker, types.FunctionType) else maker
 
@@ -213,8 +201,7 @@ def compilation_key(maker: Any) -> Any:
 def is_traceable(policy: Any) -> bool:
     """Return whether a policy declares that its methods can be traced and compiled.
 
-    The declaration must be in the object, or in the class that defines the methods or one derived from it: it does
-    not apply to methods that a subclass replaces.
+    The declaration does not apply to methods that a subclass replaces.
     """
     own = getattr(policy, "__dict__", {})
     if "traceable" in own:
@@ -249,7 +236,7 @@ class FunctionPolicy(Policy):
             self.control = control  # type: ignore[misc]  # of the function, not of the class
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the function's actions for a batch of observations; it has no memory."""
+        """Return the function's actions for a batch of observations, and None as memory."""
         return host_array(self.function(observation)), None
 
 
@@ -260,7 +247,7 @@ class ConstantPolicy(Policy):
     action: tuple[float, ...]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the constant action for every episode, ``(N, A)``; it has no memory."""
+        """Return the constant action for every episode, ``(N, A)``, and None as memory."""
         return numpy.tile(1.0 * numpy.asarray(self.action), (len(observation), 1)), None
 
 
@@ -269,14 +256,7 @@ DRAWN_AT_ONCE = 32
 
 
 class RandomActions:
-    """Random actions of parallel episodes, with a random generator for each episode.
-
-    Several decisions are drawn in one call; the numbers equal those of one draw after another.
-
-    Args:
-        generators: random generators, one for each episode.
-        space: Gymnasium space of one action.
-    """
+    """Random actions of parallel episodes, from one generator for each episode and the space of one action."""
 
     def __init__(self, generators: Sequence[numpy.random.Generator], space: Any) -> None:
         self._generators, self._space = generators, space
@@ -306,12 +286,12 @@ class RandomPolicy(Policy):
         self.control: str = model.control  # type: ignore[misc]  # it suits every control
 
     def begin(self, seeds: Sequence[int]) -> RandomActions:
-        """Return the random actions of the episodes, with a generator for each, seeded by policy and episode."""
+        """Return the generators of random actions, one for each episode, seeded by policy and episode."""
         generators = [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
         return RandomActions(generators, self.model.action_space)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return random actions of the action space, each row by the generator of its episode."""
+        """Return uniformly random actions ``(N, ...)``, and their generators as memory."""
         actions = self.begin(range(len(observation))) if state is None else state
         return actions.next(), actions
 
@@ -319,8 +299,8 @@ class RandomPolicy(Policy):
 class Estimator(Protocol):
     """Protocol of a user's estimator: any object with these two methods, for arrays ``(..., N)`` of N episodes.
 
-    A class is made for the task if its constructor takes an argument: ``task.parameters`` contains every constant,
-    ``task.components`` the estimated components with their units. Nothing else of the task is needed.
+    A class is made for the task if its constructor takes an argument: ``task.parameters`` contains every
+    constant, ``task.components`` the estimated components with their units.
 
     N is a multiple of eight: the last episode is repeated in further lanes (parallel episodes), so that rounding in
     matrix products does not depend on the number of episodes.
@@ -359,9 +339,9 @@ class Estimator(Protocol):
 class Smoother(Estimator, Protocol):
     """Protocol of an estimator that estimates each time with later measurements, too.
 
-    It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares ``kind =
-    "smoother"``; without it an estimator with a method ``smooth`` is evaluated by its causal estimates. A
-    closed loop, where the estimate decides what is measured next, raises an error for a smoother.
+    It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares
+    ``kind = "smoother"``; without it an estimator with a method ``smooth`` is evaluated by its causal
+    estimates. It cannot run in a closed loop.
     """
 
     kind: ClassVar[Kind] = "smoother"

@@ -1,9 +1,9 @@
 """Log-likelihood of recorded measurements as a function of an estimator's parameters, for fitting them.
 
-A recording is cut into windows, which run in parallel. A window begins some measurements before those that count, so
-that the effect of the initial estimate has decayed. Lanes are windows times candidates: an estimator whose parameters
-may be arrays ``(N,)`` runs all candidates at once, compiled where it can be traced. So a gradient by finite differences
-costs one run. A long run processes its measurements in stretches, so that its memory does not grow with their number.
+A recording is cut into windows, which run in parallel and begin some measurements before those that count.
+Lanes are windows times candidates: an estimator whose parameters may be arrays ``(N,)`` runs all candidates
+at once, so that a gradient by finite differences costs one run. Long runs are processed in stretches, for
+constant memory.
 """
 
 import copy
@@ -59,22 +59,22 @@ class Windows(NamedTuple):
     """Cache of the initial estimates and measurements repeated for several candidates, by their number."""
 
     def measurement(self, k: int) -> Any:
-        """Return measurement number k of every window, the task's ``Measurement`` of arrays ``(..., W)``."""
+        """Return measurement k of every window, the task's ``Measurement`` of arrays ``(..., W)``."""
         return map_arrays(lambda array: array[k], self.measurements)
 
 
 def cut_windows(
     recording: Recording, task: Task, spans: Sequence[Span], warm_up: int, every: int = 1
 ) -> Windows:
-    """Return windows of a recording, each with an initial estimate from its own first measurements.
+    """Cut a recording into windows, each with an initial estimate from its own first measurements.
 
     Args:
         recording: recording of the task.
-        task: task on NumPy arrays; its log format defines the start of a track. Without one, or where a window begins
-            with the recording, the recording's own initial estimate applies.
+        task: task on NumPy arrays; its log format starts a track inside the recording.
         spans: measurements that count in the likelihood.
-        warm_up: number of measurements to process before those that count, where there are as many.
-        every: of measurements with a field ``available``, one in ``every`` is received, the others are missing.
+        warm_up: number of measurements to process before those that count.
+        every: of measurements with a field ``available``, one in ``every`` is received, the others are
+            missing.
     """
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
     starts, pieces, counted = [], [], []
@@ -104,7 +104,7 @@ def cut_windows(
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
-    """Return the mask of available measurements, ``(T, W)``, thinned to the first, then one in ``every``."""
+    """Thin a mask of available measurements ``(T, W)`` to one in ``every``, beginning with the first."""
     kept = numpy.zeros_like(available)
     since = numpy.full(available.shape[1], every)
     for row, values in zip(kept, available, strict=True):
@@ -145,7 +145,7 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
 
 
 def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
-    """Return values padded to a length with the last measurement; padding never counts in the likelihood."""
+    """Pad values to a length by repeating the last measurement."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
 
@@ -153,7 +153,9 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _update(
     task: Task, names: tuple[str, ...], apply: Apply, values: Array, measurement: Any, memory: Any
 ) -> tuple[Any, Array]:
-    """Return an estimator's memory after a measurement, and its log-likelihood ``(N,)``, for parameters ``(P, N)``."""
+    """Return an estimator's memory after a measurement, and its log-likelihood ``(N,)``, for parameters
+    ``(P, N)``.
+    """
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
     return _step(as_filter(task, own), measurement, memory)
 
@@ -173,10 +175,6 @@ class WindowLikelihood:
         start: values of the parameters with a finite likelihood, by name.
         apply: function from parameters to the task's keywords and the estimator's maker.
         in_lanes: whether every parameter can be an array ``(N,)``; otherwise candidates run one after another.
-
-    Attributes:
-        names: names of the parameters.
-        count: number of measurements that count.
 
     Raises:
         ValueError: if the estimator returns no log-likelihood of measurements, or none counts.
@@ -213,16 +211,14 @@ class WindowLikelihood:
             raise ValueError("the recording has no measurement that counts")
 
     def on(self, windows: Windows) -> "WindowLikelihood":
-        """Return the same likelihood function for other windows, without compiling it again."""
+        """Return the same likelihood function of other windows, without compiling it again."""
         other = copy.copy(self)
         other._take(windows)
         return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; -inf where it is not finite.
-
-        Args:
-            values: parameters, candidates last, ``(P, C)``.
+        """Return the log-likelihood of all measurements that count for parameters ``(P, C)``, nats, ``(C,)``;
+        -inf if not finite.
         """
         if not self.in_lanes and values.shape[1] > 1:
             return numpy.concatenate([self(values[:, [i]]) for i in range(values.shape[1])])
@@ -251,7 +247,7 @@ class WindowLikelihood:
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 
     def _stretches(self, values: numpy.ndarray) -> Iterator[numpy.ndarray]:
-        """Yield the log-likelihoods of all measurements, ``(rows, W, C)``, in successive parts of the T rows."""
+        """Yield log-likelihoods of successive stretches of measurements, ``(rows, W, C)``."""
         count, W = values.shape[1], self._counts.shape[1]
         width = round_up_lanes(count * W)
         given = numpy.ascontiguousarray(values[:, numpy.minimum(numpy.arange(width) // W, count - 1)])
@@ -266,9 +262,8 @@ class WindowLikelihood:
     def _run(
         self, values: numpy.ndarray, initial: Any, measurements: Any, memory: Any
     ) -> tuple[numpy.ndarray, Any]:
-        """Run all lanes through some measurements; return their log-likelihoods ``(rows, lanes)`` and the memory.
-
-        With a memory of None the estimator starts from ``initial``.
+        """Run all lanes through some measurements; return log-likelihoods ``(rows, lanes)`` and memory (None:
+        from ``initial``).
         """
         found = numpy.empty((len(leaves(measurements)[0]), initial.mean.shape[-1]))
         given = values if self.in_lanes else values[:, 0]
@@ -295,7 +290,7 @@ class WindowLikelihood:
         memory: Any,
         found: numpy.ndarray,
     ) -> Any:
-        """Run all lanes in compiled code with two alternating memories; write to ``found`` and return the memory."""
+        """Run all lanes in compiled code; write log-likelihoods to ``found`` and return the memory."""
         program = function.specialise(values, map_arrays(lambda array: array[0], measurements), memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
         memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
@@ -318,7 +313,7 @@ class WindowLikelihood:
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
     def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
-        """Return initial estimates and a stretch of measurements, repeated for each candidate, ``(..., lanes)``."""
+        """Repeat initial estimates and a stretch of measurements for each candidate, ``(..., lanes)``."""
         tiles = self.windows.tiles
         if count in tiles:
             return tiles[count]

@@ -1,6 +1,6 @@
 """Filter for real-time use, which takes measurements one by one and returns estimates.
 
-The same code runs it in an evaluation: the same measurements give the same bits.
+The same measurements give the same bits as in an evaluation.
 """
 
 import copy
@@ -40,16 +40,14 @@ REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
 
 
 class OnlineFilter:
-    """Filter that processes measurements as they arrive.
+    """Filter for real-time use, updated with measurements as they arrive, also late ones.
 
     Args:
         model: model with the bank of the competitor's control; its world takes measurements from outside.
         competitor: policy or estimator, or its maker.
-        name: name of the competitor, for error messages.
         tracks: number of parallel tracks.
         watch: comparison of a network's inputs with those of its training; None without a network.
-        lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`. Each measurement
-            within the lag is stored with the states of the filter and of the policy or estimator.
+        lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`.
 
     Raises:
         ValueError: for a competitor that needs the truth or later measurements.
@@ -122,7 +120,7 @@ class OnlineFilter:
         return f"<OnlineFilter {self.name!r} of {self.task.id}; update takes {takes}>"
 
     def __reduce__(self) -> Any:
-        """Raise TypeError: a filter runs machine code of this process and cannot be copied."""
+        """Raise TypeError, since compiled code of this process cannot be copied or pickled."""
         raise TypeError(
             "a running filter cannot be copied or pickled: make another with filtergym.online, and restore the state "
             "that save of this one returns"
@@ -167,7 +165,7 @@ class OnlineFilter:
 
         Args:
             first: ``time`` and values of the sensors of the first measurement, as in :meth:`update`.
-            second: ``time`` and values of the sensors of the second measurement.
+            second: those of the second measurement.
 
         Raises:
             ValueError: for values that are missing or unknown, or where two measurements cannot start a track.
@@ -212,11 +210,11 @@ class OnlineFilter:
 
     @property
     def too_late(self) -> int:
-        """Number of measurements since the start that were rejected since they were older than ``lag``."""
+        """Number of measurements since the start that were older than ``lag`` and therefore rejected."""
         return self._running().too_late
 
     def _take(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Update the filter with a measurement that is not older than the last, and return the estimate."""
+        """Update with a measurement not older than the last one; return the estimate."""
         before = self._running()
         last = before.input["time"]
         if _any((at >= SINCE_1970) & (last < SINCE_1970)):
@@ -251,7 +249,9 @@ class OnlineFilter:
         return found
 
     def _take_late(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Update with a late measurement at its own time, then again with the later ones; return the estimate."""
+        """Go back to a late measurement's time, process it and the later ones again; return the last
+        estimate.
+        """
         state = self._running()
         taken = state.history.taken
         oldest = taken[0].before.input["time"] if taken else state.input["time"]
@@ -283,7 +283,7 @@ class OnlineFilter:
             raise
 
     def _remember(self, one: Taken) -> None:
-        """Store a processed measurement for later repetition, and drop those older than ``lag``."""
+        """Store a processed measurement, and drop those older than ``lag``."""
         state = self._running()
         taken = (*state.history.taken, one)
         if isinstance(self._lag, timedelta):
@@ -294,7 +294,7 @@ class OnlineFilter:
         self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: Any, at: Any) -> list[Any]:
-        """Return the times of scans without a detection since the last measurement, for a log with scans."""
+        """Return the times of missed scans between the last measurement and this one, for sensors with scans."""
         interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
         if scans > MOST_MISSED:
@@ -305,7 +305,6 @@ class OnlineFilter:
         return [last + (at - last) * number / scans for number in range(1, scans)]
 
     def _step(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Predict to a time, update with the values received and return the estimate."""
         measurement, memory = self.input.measure(self._running().input, at, values)
         found = self._estimate(at, self._advance(measurement, memory))
         if any(found.lost):
@@ -314,7 +313,7 @@ class OnlineFilter:
         return found
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
-        """Return the reasons why tracks are lost, with the task's explanation from the last valid estimates."""
+        """Return why each track is lost, with the task's explanation from the last valid estimates."""
         near = self._valid if self._is_policy else found
         if near is None:
             return found.lost
@@ -332,13 +331,15 @@ class OnlineFilter:
         return self._each(words)
 
     def _received_of(self, measurement: Any, track: numpy.ndarray) -> Any:
-        """Return the measurement of one track in arrays ``(..., 1)`` of the task's types."""
+        """Return the measurement of one track, in arrays ``(..., 1)`` of the task's types."""
         memory = MeasurementMemory(self.input.measurement, self.tracks)
         memory.put(measurement)
         return select_lanes(memory.copy(), track)
 
     def _advance(self, measurement: Any, memory: Any) -> dict[str, Any]:
-        """Update with the task's measurement; return the report in arrays ``(..., N)``, for one track ``(...)``."""
+        """Update with the task's measurement, choosing an action if due; return mean, covariance and statistics
+        by name.
+        """
         before: Any = self._running()
         update = self._update
         # Equal to _replace, which takes longer than the filter: other input, one more measurement.
@@ -347,14 +348,14 @@ class OnlineFilter:
         if self._policy is not None:
             after = self._decide(after, update.observation)
         elif self.watch is not None and before.measurements % self._interval == 0:
-            after = self._look(after, update.observed[: self.tracks])
+            after = self._compare_inputs(after, update.observed[: self.tracks])
         if self._is_in_python:
             update.act(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
 
-    def _look(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
-        """Compare a network's inputs, ``(N, fields)``, with those of its training; return the state."""
+    def _compare_inputs(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
+        """Compare a network's inputs ``(N, fields)`` with those of its training."""
         if self.watch is not None and state.fresh is not None:
             self.watch.look(observation, state.fresh)
         return state._replace(fresh=numpy.zeros(self.tracks, dtype=bool))
@@ -378,7 +379,7 @@ class OnlineFilter:
             self._resume(kept)
 
     def save(self) -> OnlineState:
-        """Return the complete state of the filter, with which this or another process can continue."""
+        """Return a copy of the filter's complete state, from which this or another process can continue."""
         return copy.deepcopy(self._snapshot()._replace(owner=self._owner))
 
     def _snapshot(self) -> OnlineState:
@@ -393,8 +394,7 @@ class OnlineFilter:
         """Set the filter to a state that :meth:`save` has returned.
 
         Raises:
-            ValueError: for any other object, for a changed state from which the filter cannot continue, and for a state
-                of another filter; the filter is then unchanged.
+            ValueError: for any other object, or an invalid state; the filter is then unchanged.
         """
         if not isinstance(state, OnlineState):
             raise ValueError(f"restore takes a state that save has returned, got {quote_shortened(state)}")
@@ -406,7 +406,7 @@ class OnlineFilter:
         state = state if self._lag else state._replace(history=History())
         kept = None if self._state is None else self._snapshot()
         try:
-            self._try(state)
+            self._check_state(state)
             self._resume(state)
         except Exception as error:  # a changed part can raise any error
             self._state = None
@@ -418,8 +418,8 @@ class OnlineFilter:
                 f"{quote_shortened(reason)}"
             ) from None
 
-    def _try(self, state: OnlineState) -> None:
-        """Check a state by an update with an example measurement, which may raise any error."""
+    def _check_state(self, state: OnlineState) -> None:
+        """Check a state by an update with an example measurement; any error may be raised."""
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
         begun = self._begin(map_arrays(first_track, self.input.initial), {})
@@ -451,7 +451,7 @@ class OnlineFilter:
             self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
-        """Set the filter to a state from ``_snapshot``, which is not changed."""
+        """Set the filter to a copy of a state."""
         state = copy.deepcopy(state) if self._is_in_python else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
@@ -466,7 +466,7 @@ class OnlineFilter:
     # --- one measurement
 
     def _decide(self, state: OnlineState, inputs: numpy.ndarray) -> OnlineState:
-        """Choose an action from the observation ``(width, fields)`` where a decision is due; return the state."""
+        """Let the policy choose an action if a decision is due; return the state."""
         assert self._policy is not None
         number, observation = state.measurements - 1, inputs.T
         if number:
@@ -477,7 +477,7 @@ class OnlineFilter:
         if number % self._interval == 0:
             inputs = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(inputs, state.policy, state.fresh)
-            state = self._look(state._replace(policy=memory, action=action), inputs)
+            state = self._compare_inputs(state._replace(policy=memory, action=action), inputs)
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:
@@ -500,11 +500,7 @@ class OnlineFilter:
         return self._state
 
     def _times(self, time: Any) -> Any:
-        """Return a time argument as seconds, an array ``(N,)``, or for one track a float.
-
-        Raises:
-            ValueError: for a time that is not finite, or of another shape.
-        """
+        """Return a user's time as finite seconds, an array ``(N,)``, or for one track a float."""
         found = read_numbers("time", time)
         if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
             raise ValueError(
@@ -519,7 +515,7 @@ class OnlineFilter:
         return self._usual
 
     def _time_of(self, time: Any) -> Any:
-        """Return the time of a measurement, s, ``(N,)`` or a float; by default one interval after the last."""
+        """Return the time of a measurement, s, by default one sampling interval after the last."""
         if time is None:
             return self._running().input["time"] + self._default_interval()
         if self.tracks == 1 and isinstance(time, float | int) and 0.0 <= time < SINCE_1970:
@@ -527,7 +523,7 @@ class OnlineFilter:
         return self._times(time)
 
     def _refuse_interval(self, at: Any) -> None:
-        """Raise ValueError for measurements that are too close in time, with the permitted interval."""
+        """Raise ValueError with the least permitted interval between measurements."""
         last, share = self._running().input["time"], self.model.filter.least_interval
         why = f": the gains of {self.name!r} are made for {self._usual:g} s and make speeds of noise below"
         raise ValueError(
@@ -553,7 +549,7 @@ class OnlineFilter:
             )
 
     def _padded(self, part: Any) -> Any:
-        """Return arrays with the last track repeated up to a multiple of eight, which fixes rounding."""
+        """Return arrays with the last track repeated up to a multiple of eight lanes, which fixes rounding."""
         return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
 
     def _check_restart(self) -> None:
@@ -566,7 +562,7 @@ class OnlineFilter:
             )
 
     def _merge(self, new: OnlineState, tracks: Any) -> OnlineState:
-        """Return the state with restarted tracks from ``new`` and the other tracks unchanged."""
+        """Return the present state with the chosen tracks replaced by those of ``new``."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
         try:
             numbers = numpy.asarray(tracks)
@@ -599,7 +595,7 @@ def _shapes(part: Any) -> list[tuple[int, ...]]:
 
 
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return mean, covariance and statistics of the measurement of a model's filter, by name."""
+    """Return mean, covariance and statistics of the measurement by name, from a model's filter."""
     records = model.filter.records(episode.filter, episode.measurement)
     mean, covariance = model.filter.mean(episode.filter), model.filter.covariance(episode.filter)
     known = {name: records[name] for name in REPORTED if name in records}
@@ -610,7 +606,6 @@ def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
-    """Return the numbers of the faults of estimates, ``(N,)``, see :func:`.filters.find_fault`."""
     nothing = numpy.zeros(mean.shape[-1])
     return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
@@ -620,12 +615,11 @@ def _any(condition: Any) -> bool:
 
 
 def _plain(values: Any) -> Any:
-    """Return an array as a float if all its values are equal, else unchanged."""
+    """Return an array of equal values as a float, others unchanged."""
     return values if values.__class__ is float or (values != values[0]).any() else float(values[0])
 
 
 def _check_lag(lag: Any) -> int | timedelta:
-    """Return the lag, after a check that it is a number of measurements or a time."""
     if not isinstance(lag, timedelta):
         return check_integer("lag", lag, 0)
     if lag < timedelta(0):
@@ -634,7 +628,7 @@ def _check_lag(lag: Any) -> int | timedelta:
 
 
 def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return a measurement completed by another of the same time; None if nothing is added, or they differ."""
+    """Merge two measurements of the same time; None if the second adds nothing, or they differ."""
     both, new = dict(given), False
     for name, value in late.items():
         first, second = _numbers(given.get(name)), _numbers(value)
@@ -651,7 +645,7 @@ def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _numbers(value: Any) -> numpy.ndarray:
-    """Return the value of a sensor as an array; NaN if it is no number, which the environment reports later."""
+    """Return a sensor's value as an array; NaN if it is no number."""
     try:
         return read_numbers("it", numpy.nan if value is None else value)
     except ValueError:

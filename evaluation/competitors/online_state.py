@@ -1,4 +1,4 @@
-"""Estimate and complete state of a filter in real-time use."""
+"""Estimate, history and complete state of a filter in real-time use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from ...envs.engine.programs import Report
 
 
 class Watch(Protocol):
-    """Protocol of a comparison of a network's inputs with those of its training."""
+    """Protocol of a monitor that compares a network's inputs with those of its training."""
 
     memory: Any
     """Statistics of the inputs so far."""
@@ -20,11 +20,13 @@ class Watch(Protocol):
     """
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Add inputs ``(N, fields)`` to the memory; ``start`` marks the tracks that have just begun."""
+        """Add a network's inputs ``(N, fields)`` to the statistics; ``start`` marks tracks that have just
+        begun.
+        """
         ...
 
     def describe(self) -> list[str]:
-        """Return a description of unusual inputs for each track; empty for usual inputs."""
+        """Return a description of each track's unusual inputs, empty for usual ones."""
         ...
 
 
@@ -74,7 +76,7 @@ class Estimate:
 
 
 class Taken(NamedTuple):
-    """A measurement that an online filter has processed, for repetition after a late one."""
+    """A measurement that an online filter has processed, stored in order to repeat it after a late one."""
 
     time: numpy.ndarray
     """Time, s, ``(N,)``."""

@@ -22,7 +22,7 @@ from . import isolated_estimator
 
 
 def quickest_form(source: str) -> str:
-    """Return the path of a source file's compiled form, which starts faster; the source if that is outdated."""
+    """Return the path of a Python file's compiled form, or the source if that form is missing or outdated."""
     compiled = cache_from_source(source)
     try:
         with open(compiled, "rb") as file:
@@ -68,7 +68,7 @@ class Failure(Exception):  # noqa: N818  (a program's failure, not an error of t
 
 
 class ProgramProcess:
-    """A running program, with pipes to its standard input and output.
+    """A running program, with pipes to its standard input and output and a limit of time for each response.
 
     Args:
         command: the program and its arguments; no shell runs it. Empty: an estimator, see :mod:`.isolated_estimator`.
@@ -112,7 +112,7 @@ class ProgramProcess:
         Args:
             request: bytes of the request.
             size: number of bytes of the response; None: it is a line.
-            most: maximal bytes of a line.
+            most: limit of bytes of a line.
 
         Raises:
             Failure: if there is no such response in time.
@@ -134,22 +134,11 @@ class ProgramProcess:
                 self._read(key.fd)
 
     def send(self, message: bytes) -> None:
-        """Write a message without a response to the program.
-
-        Raises:
-            Failure: if the program does not read it in time.
-        """
+        """Write a message without a response to the program."""
         self.exchange(message, 0)
 
     def finish(self) -> None:
-        """Close the program's input, and check that it writes nothing more.
-
-        It has ``END_SECONDS`` to end.
-
-        Raises:
-            Failure: if it writes more: then an earlier response was one too many, and later ones belong to other
-                requests.
-        """
+        """Close the program's input and wait ``END_SECONDS`` for its end; raise Failure if it writes more."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         until, goes_on = time.monotonic() + END_SECONDS, True
@@ -165,7 +154,7 @@ class ProgramProcess:
             raise Failure(WRONG, MORE)
 
     def _write(self, unsent: memoryview) -> memoryview:
-        """Write as much of a message as the pipe takes; return the rest."""
+        """Write as much of a message as the pipe takes now; return the rest."""
         try:
             unsent = unsent[os.write(self._to, unsent) :]
         except BlockingIOError:
@@ -196,7 +185,7 @@ class ProgramProcess:
             self._buffer += found
 
     def _whole_response(self, size: int | None, most: int) -> bytes | None:
-        """Return the response from the bytes read so far and remove it from them; None if it is incomplete."""
+        """Take one complete response from the bytes read so far; None if it is incomplete."""
         buffer = self._buffer
         if size is None:
             end = buffer.find(b"\n")
@@ -212,7 +201,7 @@ class ProgramProcess:
         return found
 
     def _explain_end(self) -> Failure:
-        """Return an error that describes how the program has ended, with its last line on standard error."""
+        """Return an error with the program's exit status and its last line on standard error."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         if self._errors in self._selector.get_map():
@@ -271,7 +260,6 @@ def _widen(pipe: int) -> None:
 
 
 def _end(process: "subprocess.Popen[bytes]", selector: selectors.BaseSelector) -> None:
-    """Close the pipes and kill the process with its descendants."""
     selector.close()
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:

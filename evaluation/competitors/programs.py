@@ -1,20 +1,6 @@
 """Programs in any language as competitors: separate processes that use standard input and output.
 
-This is version 1 of the protocol; docs/programs.md describes it for authors of programs.
-
-1. This package writes a line of JSON, the **hello**: the estimated components, the fields of the messages, and the
-    number of tracks.
-2. The program writes a line: the version, and the format of all further messages, ``json`` or ``float64``; or an
-    ``error``, one sentence, and then takes no part.
-3. This package writes the initial estimate, which has no response, and then one measurement after another. For each the
-    program writes means and covariances before the next one is sent.
-4. At the end this package closes the program's standard input, and the program ends.
-
-As ``json`` a message is a line, as ``float64`` a frame of little-endian numbers without a head: for every track its
-fields, or mean and covariance, row by row. So thousands of tracks are one message.
-
-Where the task defines feedback (:class:`.ArrayMeanings`), the hello offers it. A program that responds with
-``"feedback": true`` writes its feedback after mean and covariance.
+docs/programs.md describes version 1 of the protocol: a hello, the format of the messages, measurements and responses.
 """
 
 import json
@@ -53,7 +39,7 @@ LIMITS: ContextVar[Limits] = ContextVar("limits", default=USUAL)
 
 @contextmanager
 def limit_programs(seconds: float, memory: float) -> Iterator[None]:
-    """Set the limits of time, s, and memory, MB, of the programs that are made inside the context.
+    """Set the limits of time, s, and memory, MB, for programs made inside the context.
 
     Raises:
         ValueError: for a time that is not above zero, or a negative memory.
@@ -70,9 +56,8 @@ def limit_programs(seconds: float, memory: float) -> Iterator[None]:
 
 
 def search_path() -> str:
-    """Return the value of PATH for programs, with the folder of the virtual environment first.
-
-    So ``python`` is the interpreter that has the package, whether the environment is activated or not.
+    """Return PATH for programs, with the virtual environment's folder first, so that ``python`` has the
+    package.
     """
     usual = os.environ.get("PATH", os.defpath)
     return (
@@ -83,11 +68,6 @@ def search_path() -> str:
 @dataclass(frozen=True)
 class Program:
     """A program that competes as an estimator; a call with a task returns that estimator.
-
-    Args:
-        command: the program and its arguments, one text as in a shell; no shell runs it.
-        limits: limits of its time for each response and of its memory.
-        words: see the attributes, also for the other arguments.
 
     Raises:
         ValueError: if there is no such program, or no system on which it could run.
@@ -141,7 +121,7 @@ class ArrayField(NamedTuple):
 
 
 def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
-    """Yield a description of each array of nested NamedTuples ``(..., N)``, in the order of ``leaves``."""
+    """Yield name, shape, type and meaning of each array of nested NamedTuples ``(..., N)``, depth first."""
     about = field_words(type(part))
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
@@ -172,13 +152,15 @@ def parameters_of(task: Task) -> dict[str, Any]:
 
 
 def rows_of(part: Any, count: int) -> numpy.ndarray:
-    """Return the numbers of nested tuples of arrays ``(..., N)`` as one row for each track, ``(count, numbers)``."""
+    """Flatten nested tuples of arrays ``(..., N)`` to one row of numbers for each track,
+    ``(count, numbers)``.
+    """
     flat = [numpy.asarray(a, dtype="<f8").reshape(-1, numpy.shape(a)[-1])[:, :count] for a in leaves(part)]
     return numpy.ascontiguousarray(numpy.concatenate(flat).T)
 
 
 def as_lists(values: numpy.ndarray) -> Any:
-    """Return an array as nested lists of numbers, None where one is not finite."""
+    """Return an array as nested lists, with None in place of numbers that are not finite."""
     held = values.astype(object)
     held[~numpy.isfinite(values)] = None
     return held.tolist()
@@ -187,11 +169,7 @@ def as_lists(values: numpy.ndarray) -> Any:
 class ProgramEstimator:
     """Estimator that runs a program for all episodes, see :class:`.kinds.Estimator`.
 
-    A fault of the program does not end an evaluation: all tracks are lost from then on, and a warning gives the reason.
-
-    Args:
-        task: the estimation problem.
-        program: the program to run.
+    A fault of the program does not end an evaluation: all tracks are lost with a warning.
 
     Attributes:
         tracks: number of the N lanes that are tracks; the others repeat the last one.
@@ -219,7 +197,7 @@ class ProgramEstimator:
         self._fields: list[ArrayField] = []
 
     def start(self, initial: Any, N: int) -> int:
-        """Start the program; return the memory, which is the number of measurements so far.
+        """Start the program; return the estimator's memory, the number zero of measurements so far.
 
         The hello is sent with the first measurement, since it describes its fields.
 
@@ -284,7 +262,7 @@ class ProgramEstimator:
         return float("nan") if self._process is None else self._process.processor_seconds
 
     def end(self) -> None:
-        """End the program's process."""
+        """End the program's process, if it runs."""
         if self._process is not None:
             self._process.end()
             self._process = None
@@ -292,14 +270,18 @@ class ProgramEstimator:
     def hello(self, measurement: Any) -> dict[str, Any]:
         """Return the first message to the program: components, fields of messages, number of tracks.
 
-        The keys that programs in plain C search are at its beginning.
+        Keys for programs in plain C come first.
         """
         C, measured = len(self.task.components), list(fields_of(measurement))
-        numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
+        numbers = {
+            "initial": _count_entries(self._fields),
+            "measurement": _count_entries(measured),
+            "answer": C + C * C,
+        }
         offered = {}
         if self._feedback_field is not None:
             offered = {"feedback": [self._feedback_field._asdict()]}
-            numbers["feedback"] = _count([self._feedback_field])
+            numbers["feedback"] = _count_entries([self._feedback_field])
         return {
             "filtergym": VERSION,
             "tracks": self.count,
@@ -319,10 +301,10 @@ class ProgramEstimator:
     @property
     def _response_size(self) -> int:
         C = len(self.task.components)
-        return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
+        return C + C * C + (0 if self._feedback_field is None else _count_entries([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
-        """Exchange the first messages (hello and format) with the program, and send the initial estimate."""
+        """Exchange the first messages with the program: hello, format of messages, initial estimate."""
         assert self._process is not None
         assert self._initial is not None
         hello = self.program.preface + json.dumps(self.hello(measurement)).encode() + b"\n"
@@ -351,14 +333,14 @@ class ProgramEstimator:
         for own in fields:
             if own.shape is None:
                 continue
-            size = _count([own])
+            size = _count_entries([own])
             values = rows[:, place : place + size].reshape(-1, *own.shape)
             content[own.name] = as_lists(values if own.type == "float64" else values.astype(own.type))
             place += size
         return json.dumps({name: content}).encode() + b"\n"
 
     def _exchange(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
-        """Send a measurement to the program; return its response as numbers, ``(tracks, C + C * C)``."""
+        """Send a measurement; return the program's means and covariances as rows of numbers."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
         size = self.count * self._response_size
@@ -384,17 +366,12 @@ class ProgramEstimator:
         return numpy.concatenate(found, axis=1)
 
 
-def _count(fields: Sequence[ArrayField]) -> int:
-    """Return the total number of entries of these fields for one track."""
+def _count_entries(fields: Sequence[ArrayField]) -> int:
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 
 def _read_object(line: bytes) -> dict[str, Any]:
-    """Parse a program's response as a JSON object.
-
-    Raises:
-        Failure: if it is no JSON object.
-    """
+    """Parse a program's response as a JSON object; raise Failure otherwise."""
     try:
         found = json.loads(line)
     except (ValueError, RecursionError):
@@ -406,5 +383,5 @@ def _read_object(line: bytes) -> dict[str, Any]:
 
 
 def find_program(name: str, command: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor for the name ``exec:COMMAND``, which runs that command."""
+    """Return the competitor named ``exec:COMMAND``, a program started by that command."""
     return Competitor(name, Program(command))

@@ -20,13 +20,7 @@ from .filters import AdaptedState, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
-    """Filter that returns estimates that a smoother has computed before; its state is the number of measurements.
-
-    Args:
-        task: the estimation problem.
-        means: smoothed means at K measurements, ``(C, K, N)``.
-        covariances: smoothed covariances, ``(C, C, K, N)``.
-    """
+    """Filter that replays the estimates of a smoother; its state is the number of measurements."""
 
     in_python = True
 
@@ -39,11 +33,11 @@ class SmoothedTrack(Filter[Task, Any, int]):
         """Index of the episode of each lane; further lanes repeat the last episode."""
 
     def start(self, initial: Any) -> int:
-        """Return the state before the first measurement: zero measurements."""
+        """Return zero, the number of measurements so far."""
         return 0
 
     def update(self, state: int, inputs: FilterInput) -> int:
-        """Return the state after one more measurement."""
+        """Return the number of measurements, increased by one."""
         return state + 1
 
     def mean(self, state: int) -> Array:
@@ -56,12 +50,7 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if a model's estimates affect its later measurements (closed loop).
-
-    Args:
-        model: model in which a smoother or estimates from a file are to run.
-        name: kind and name of the competitor.
-    """
+    """Raise ValueError in a closed loop, where a model's estimates affect its later measurements."""
     if model.task.closes_loop:
         raise ValueError(
             f"{name} cannot run in {model.task.id}, a closed loop with these parameters, where the "
@@ -70,16 +59,8 @@ def check_open_loop(model: Model, name: str) -> None:
 
 
 def run_forward(model: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Run a smoother forward over episodes; return the smoothed means and covariances.
-
-    Args:
-        model: model with the smoother as its filter.
-        lanes: episodes of the model, with their first measurement.
-        length: number of measurements of each episode.
-        name: name of the smoother, for error messages.
-
-    Returns:
-        Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of K measurements.
+    """Run a smoother over episodes of one length; return means ``(C, K, N)`` and covariances
+    ``(C, C, K, N)``.
 
     Raises:
         ValueError: if its estimates have other shapes.
@@ -117,7 +98,7 @@ def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
 
 
 def _run_compiled(model: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Return the measurements, with missing ones masked, and the memories of a compiled smoother."""
+    """Run a compiled smoother forward; return masked measurements and memories of all scans."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
@@ -131,13 +112,7 @@ def _run_compiled(model: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans
 
 
 def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
-    """Run episodes from their start; yield reports on successive stretches of measurements, ``(scans, ..., N)``.
-
-    Args:
-        lanes: compiled episodes, whose filter has no policy.
-        report: function of model and episode that returns arrays ``(..., N)``, see :meth:`.Lanes.run`.
-        length: number of measurements of each episode.
-    """
+    """Run compiled episodes; yield reports on successive stretches of measurements, ``(scans, ..., N)``."""
     together = max(1, TOGETHER // lanes.width)
     for first in range(0, length, together):
         yield lanes.run(report, measurements=min(together, length - first))[0]
@@ -158,17 +133,8 @@ def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
 def report_smoothed(
     model: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Yield the reports that a filter with the smoothed estimates would give, for stretches of measurements.
-
-    Args:
-        model: model with the smoothed track as its filter.
-        lanes: compiled episodes of the same world that have just begun, with any filter.
-        track: the smoothed estimates.
-        report: function that returns arrays ``(..., N)`` by name.
-        length: number of measurements of each episode.
-
-    Yields:
-        Reports on successive stretches of measurements, arrays ``(scans, ..., N)`` by name.
+    """Yield reports on the smoothed estimates by stretches of measurements, arrays ``(scans, ..., N)`` by
+    name.
     """
     start, none, first = lanes.state.filter, numpy.zeros(lanes.width), 0
     state = Checked(None, start.mean, start.covariance, none, none)
@@ -185,14 +151,8 @@ def report_smoothed(
 def _check_estimates(
     task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
 ) -> Checked:
-    """Return the states of a :class:`.CheckedFilter` with these estimates, for many measurements at once.
-
-    Args:
-        task: the estimation problem.
-        before: state before the first measurement.
-        measurement: all measurements, ``(..., scans, N)``.
-        means: ``(C, scans, N)``; changed in place where an earlier estimate is repeated.
-        covariances: ``(C, C, scans, N)``; changed in place in the same way.
+    """Apply the checks of a :class:`.CheckedFilter` to many measurements at once; lost estimates change in
+    place.
     """
     lacking = over_time(lambda some: is_lacking(task.world.mask_missing(some), numpy), measurement)
     missed = numpy.maximum.accumulate(numpy.where(lacking, 1.0, before.missed), axis=0)

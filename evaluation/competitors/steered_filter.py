@@ -1,6 +1,6 @@
 """Bank and policy combined in one filter, which computes the policy's actions itself.
 
-Traced for one track its arithmetic has no branches. So the policy is compiled and exported with its bank.
+So the policy is compiled and exported with its bank.
 """
 
 import math
@@ -45,13 +45,13 @@ Act = Callable[[Array, Any, Array], tuple[Array, Any]]
 
 
 class Decider:
-    """Policy evaluated at every measurement; its action changes only where a decision is due.
+    """Policy inside a filter: its action changes only at measurements where a decision is due.
 
     Args:
         model: model that defines the observations.
         act: function that computes the actions.
-        memory: a memory of the policy for one track, as template. The batch is the first axis of each array or else the
-            last. If one has neither, the filter is for one track: N is 1, or the arrays are traced.
+        memory: a memory of the policy for one track, as template. The batch is the first axis of each array
+            or else the last.
         interval: number of measurements for which an action holds; default: the task's decision interval.
     """
 
@@ -66,7 +66,9 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Return the policy's state before the first decision; ``zero`` is an array ``(N,)`` of zeros."""
+        """Return the policy's state before the first decision, for as many tracks as there are zeros in
+        ``zero``.
+        """
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
@@ -78,7 +80,9 @@ class Decider:
         return (state.count == 0.0) | (state.count >= float(self.interval))
 
     def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
-        """Return the present action, ``(A, N)`` or ``(N,)``, and the state after an observation ``(fields, N)``."""
+        """Update the policy's state with an observation ``(fields, N)``; return the present action and the
+        state.
+        """
         xp, K = self.xp, self.interval
         first = state.count == 0.0
         due, total = self.is_due(state), state.total
@@ -98,7 +102,7 @@ class Decider:
         return action, Decisions(memory, count, chosen, total)
 
     def _act(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
-        """Return the policy's action ``(A, N)`` and its memory, arrays ``(entries, N)``, for an observation."""
+        """Call the policy; return its action ``(A, N)`` and its memory, arrays ``(entries, N)``."""
         shapes, N = iter(self._shapes), observation.shape[-1]
 
         def restore(array: Array) -> Array:
@@ -137,12 +141,7 @@ class PolicyFilterState(NamedTuple):
 
 
 class SteeredFilter(AroundBank[PolicyFilterState]):
-    """Filter that consists of a bank and the policy that steers it.
-
-    Args:
-        model: model with the bank.
-        decider: object that computes the policy's actions.
-    """
+    """Filter that consists of a bank and the policy that steers it."""
 
     def __init__(self, model: Model, decider: Decider) -> None:
         super().__init__(model.task)
@@ -152,28 +151,22 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
         self.adapts_covariance: bool = self.bank.adapts_covariance
 
     def start(self, initial: Any) -> PolicyFilterState:
-        """Start the bank and the policy; return their states."""
+        """Start bank and policy; return their states."""
         return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
     def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
-        """Update the bank with the policy's action, which is computed anew where a decision is due."""
+        """Choose the policy's action where a decision is due, and update the bank with it; return the states."""
         observation = self.model.observe(Episode(None, inputs.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
         return PolicyFilterState(self.bank.act(state.bank, inputs.measurement, action), decisions)
 
     def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
-        """Return the bank's statistics of the measurement, by name."""
+        """Return the bank's statistics of the measurement by name."""
         return self.bank.records(state.bank, measurement)
 
 
 def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
-    """Return an object that computes a policy's actions at every measurement of a model.
-
-    Args:
-        model: model on NumPy or traced arrays.
-        policy: policy made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
-        interval: number of measurements for which an action holds; default: the task's decision interval.
-    """
+    """Make the :class:`Decider` of a policy in a model."""
     blank = numpy.zeros((1, len(model.fields)))
     with numpy.errstate(all="ignore"):
         _, memory = policy.act(blank, None, numpy.ones(1, dtype=bool))
@@ -181,24 +174,19 @@ def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Dec
 
 
 def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`.
-
-    Raises:
-        NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
-    """
+    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`."""
     return SteeredFilter(model, decider_of(model, policy, interval))
 
 
 def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
-    """Return a policy as a traced function of an observation and :class:`Decisions`, ready for compilation.
+    """Trace a policy as a function of observation and :class:`Decisions`, ready for compilation.
 
     The function returns an action and the next :class:`Decisions`, which are zero before the first decision.
 
     Args:
         model: compiled model of the policy.
         policy: policy made for that model.
-        interval: number of measurements for which an action holds; 1 where the policy is called only when a decision is
-            due.
+        interval: number of measurements for which an action holds.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.
@@ -212,14 +200,8 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
 
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
-    """Return a policy as a traced function, or None if it must run in Python.
-
-    Warn if a policy that is declared traceable cannot be traced.
-
-    Args:
-        model: model of the policy.
-        policy: policy made for that model.
-        trace: :func:`trace_policy` with its options.
+    """Trace a policy that is declared traceable; None, with a warning if tracing fails, where it must run in
+    Python.
     """
     if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and is_traceable(policy)):
         return None

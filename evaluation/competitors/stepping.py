@@ -1,7 +1,8 @@
 """Filters and policies called by the user for one measurement at a time, with the same numbers as an evaluation.
 
-A filter of a compiled model processes a measurement by one native call (:class:`CompiledUpdate`), any other by the
-functions of its model (:class:`ModelUpdate`). :class:`SteppingPolicy` computes the actions of any number of episodes.
+A compiled filter processes a measurement by one native call (:class:`CompiledUpdate`), any other by its
+model's functions (:class:`ModelUpdate`). :class:`SteppingPolicy` computes the actions of any number of
+episodes.
 """
 
 import functools
@@ -45,9 +46,8 @@ class PolicyMemory(NamedTuple):
 class SteppingPolicy(Policy):
     """Policy for a user's loop, whose actions equal those in an evaluation to the last bit.
 
-    Rounding in matrix products depends on their shape, and an episode must not depend on the number of others. So the
-    policy is called with a multiple of eight observations, a Stable-Baselines3 model always with ``MODEL_ROWS``, and
-    the last one is repeated to fill up. A policy that is ``traceable`` is compiled where the model's steps are.
+    Rounding in matrix products depends on their shape, so the policy is called with a multiple of eight
+    observations, a Stable-Baselines3 model with ``MODEL_ROWS``, the last one repeated.
 
     Args:
         model: task with the bank that the policy controls.
@@ -71,12 +71,12 @@ class SteppingPolicy(Policy):
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Keywords of ``gymnasium.make`` for an environment that fits the policy."""
+        """Keywords of ``gymnasium.make`` for the environment of the policy."""
         scenario = {} if self.scenario is None else {"scenario": self.scenario}
         return {"control": self.control, **scenario, **self.task_keywords}
 
     def begin(self, seeds: Sequence[int]) -> PolicyMemory:
-        """Return the memory for the first :meth:`predict` in some episodes; needed by random policies only."""
+        """Return the memory before the first :meth:`predict`; only random policies need it."""
         own = self.policy
         return PolicyMemory(
             [
@@ -100,9 +100,6 @@ class SteppingPolicy(Policy):
             state: memory that the last call returned; at the first call None, or the memory of :meth:`begin`.
             episode_start: mask of new episodes, ``(N,)`` booleans, or one; all are new at the first call.
             deterministic: as in Stable-Baselines3.
-
-        Returns:
-            Actions, with the batch axis where the observation has it, and the state for the next call.
 
         Raises:
             ValueError: for a state of another number of episodes, or if the policy returns no actions.
@@ -129,7 +126,7 @@ class SteppingPolicy(Policy):
     def _act(
         self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool
     ) -> tuple[Any, Any]:
-        """Return the actions and the memory of one call; in native code where the policy can be traced."""
+        """Return actions and memory of one call of the policy, in native code where it can be traced."""
         if not self._is_traced:
             trace = functools.partial(trace_policy, interval=1)
             self._traced, self._is_traced = compile_policy(self.model, self.policy, trace), True
@@ -153,11 +150,11 @@ class SteppingPolicy(Policy):
         return action.T, after
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for pickling, without compiled code: a copy compiles its own."""
+        """Return the attributes without compiled code, since a copy compiles its own."""
         return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
-        """Return the indices of the episodes in each call of the policy, padded with the last one."""
+        """Return the episodes' indices for each call of the policy, padded with the last one."""
         rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else round_up_lanes(count)
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
@@ -165,15 +162,8 @@ class SteppingPolicy(Policy):
 
 
 class MeasurementMemory:
-    """Preallocated arrays for a measurement of all tracks.
-
-    Args:
-        like: a measurement, as template of shapes and types.
-        tracks: number of parallel tracks; the last one is repeated up to a multiple of eight, since rounding in
-            matrix products must not depend on their number.
-
-    Attributes:
-        parts: the arrays, ``(..., width)``, of floats.
+    """Preallocated arrays ``(..., width)`` for a measurement of all tracks, padded to a multiple of eight
+    lanes.
     """
 
     def __init__(self, like: Any, tracks: int) -> None:
@@ -200,8 +190,7 @@ class CompiledUpdate:
 
     Where a policy acts in Python there are two calls, one before the action and one after it.
 
-    Values that the update passes on unchanged stay in the memory of the prediction or the measurement, so there are two
-    memories of both, used alternately.
+    Two memories are used alternately, since outputs may share memory with inputs.
 
     Args:
         model: compiled model, whose world takes measurements from outside.
@@ -277,7 +266,7 @@ class CompiledUpdate:
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
     def receive(self, measurement: Any) -> None:
-        """Predict to a measurement; unless a policy acts in Python, also update with it."""
+        """Predict to a measurement, and update with it unless a policy acts in Python."""
         before, now = self._now, int(self._now == 0)
         self._received[now].put(measurement)
         self._now = now
@@ -289,17 +278,17 @@ class CompiledUpdate:
         self._answers[self._now].run(self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
-        """Return copies of the values that the report function gave after the update, by name, ``(..., N)``."""
+        """Return a copy of the report after the update: arrays ``(..., N)`` by name."""
         return {name: array.copy() if array.ndim else array[()] for name, array in self._report}
 
     @property
     def state(self) -> Any:
-        """Copy of the filter's state."""
+        """Copy of the state of the filter."""
         return copy_arrays(self._template, self._states[self._now], self._kinds)
 
     @property
     def policy_state(self) -> Any:
-        """Copy of the traced policy's memory."""
+        """Copy of the memory of the traced policy."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
     def resume(self, state: Any, policy: Any) -> None:
@@ -311,7 +300,7 @@ class CompiledUpdate:
 
 
 class ModelUpdate:
-    """Filter of a model, run by the model's own functions, with an action from Python or zero.
+    """Filter of a model, run by the model's own functions for each measurement.
 
     Arguments as of :class:`CompiledUpdate`; ``like`` is a measurement, as template of shapes and types.
     """
@@ -327,7 +316,7 @@ class ModelUpdate:
         """State of the filter, in arrays that are never changed."""
 
     def receive(self, measurement: Any) -> None:
-        """Predict to a measurement."""
+        """Store a measurement and predict the filter to its time."""
         self._received.put(measurement)
         measured = self._received.copy()
         self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))
@@ -349,7 +338,7 @@ class ModelUpdate:
         self.state = self._episode.filter
 
     def report(self) -> dict[str, Any]:
-        """Return copies of the report function's values, by name, ``(..., N)``, without N for one track."""
+        """Return a copy of the report after the update: arrays ``(..., N)`` by name, without N for one track."""
         reported = self._model.run(self._make_report, self._episode)
         return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 

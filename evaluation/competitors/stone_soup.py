@@ -18,10 +18,9 @@ START = datetime(2000, 1, 1)
 class StoneSoupEstimator(SingleTrackEstimator):
     """Base class of estimators by a predictor and an updater of Stone Soup, with one state for each episode.
 
-    Subclasses set ``self.predictor`` and ``self.updater``, after ``super().__init__(task)``. Where a
-    measurement is more than positions with a covariance they define :meth:`detection`, for a control or hypotheses of
-    their own :meth:`step`, for particles :meth:`begin`.
-
+    Subclasses set ``self.predictor`` and ``self.updater``, after ``super().__init__(task)``. For other
+    measurements than positions they define :meth:`detection`, for a control or hypotheses :meth:`step`, for
+    particles :meth:`begin`.
     """
 
     predictor: Any
@@ -29,20 +28,17 @@ class StoneSoupEstimator(SingleTrackEstimator):
 
     @property
     def interval(self) -> float:
-        """Time between measurements without an interval, s; a subclass must define it where the parameters do not."""
+        """Interval of measurements that contain none, s; a subclass defines it if the task's parameters do
+        not.
+        """
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:
-        """Return the Gaussian state of Stone Soup at the initial estimate."""
+        """Return Stone Soup's Gaussian state at the initial estimate."""
         return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
 
     def detection(self, measurement: Any, timestamp: datetime) -> Any:
-        """Return the detection of the measured position, with its covariance; None if it is missing.
-
-        Args:
-            measurement: measurement of this track.
-            timestamp: time of the measurement.
-        """
+        """Return Stone Soup's detection of the measured position; None if it is missing."""
         z, R = self.reading(measurement)
         if z is None:
             return None
@@ -51,7 +47,9 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return Detection(z[:, None], timestamp=timestamp, measurement_model=model)
 
     def step(self, track: Any, measurement: Any) -> Any:
-        """Return the state predicted to the time of a measurement and updated with its detection, if there is one."""
+        """Predict a Stone Soup state to the measurement's time and update it with the detection, if there is
+        one.
+        """
         interval = measurement.interval if hasattr(measurement, "interval") else self.interval
         timestamp = track.timestamp + timedelta(seconds=float(interval))
         prediction = self.predictor.predict(track, timestamp=timestamp)
@@ -61,5 +59,5 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return self.updater.update(SingleHypothesis(prediction, detection))
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return the mean and the covariance of a state, as arrays."""
+        """Return mean and covariance of a Stone Soup state as arrays."""
         return numpy.asarray(track.mean), numpy.asarray(track.covar)

@@ -1,5 +1,4 @@
 """Figures of evaluations: error over time, the front of cost and time, animations, the worst episodes.
 
-It imports all other rooms of ``evaluation``. Begin with :mod:`.looks`, the style of each competitor; then
-:mod:`.curve_figures`.
+Begin with :mod:`.looks`, the style of each competitor; then :mod:`.curve_figures`.
 """

@@ -32,11 +32,11 @@ def episode_frames(
     every: int = 2,
     **keywords: Any,
 ) -> list[Image.Image]:
-    """Run an episode of a competitor and return its frames as a list of images.
+    """Run one episode of a competitor; return pictures of its estimates, one for each frame of an animation.
 
     Args:
         task: task class of the environment.
-        name: name of the competitor, for the title.
+        name: name of the competitor.
         competitor: policy, estimator, smoother or reference, or its maker.
         scenario: name of a scenario, or a trajectory.
         seed: seed of the episode, as in ``reset``.
@@ -81,7 +81,7 @@ def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int
 def _estimate_frames(
     model: Model, scenario: str, name: str, estimator: Any, seed: int, every: int
 ) -> list[Image.Image]:
-    """Return the frames of an episode of a competitor without observations and actions."""
+    """Return the frames of an episode of an estimator, smoother or reference."""
     # They import matplotlib.
     from ...envs.drawing.estimate_picture import EstimatePicture
     from ...envs.drawing.rendering import EpisodePicture
@@ -113,7 +113,7 @@ def _frame(world: TaskEnv) -> Any:
 
 
 def _palette() -> Image.Image:
-    """Return an image with one palette for all frames, so that colours do not flicker and details are not lost."""
+    """Return an image with the palette of all frames, so that colours do not flicker."""
     from matplotlib.colors import to_rgb
 
     # Imported here, as in the environment, since it is optional.
@@ -130,13 +130,7 @@ def _palette() -> Image.Image:
 
 
 def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
-    """Write frames as an endless GIF, whose last frame lasts two seconds.
-
-    Args:
-        frames: images of equal size, at least one.
-        path: path of the file, which is written atomically.
-        frames_per_second: number of frames per second.
-    """
+    """Write frames as an endless GIF, whose last frame lasts two seconds."""
     palette = _palette()
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]

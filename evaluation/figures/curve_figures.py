@@ -1,8 +1,7 @@
 """Figures of an evaluation from its curves (:mod:`.curves`), in the widths of a paper's columns.
 
-At most six lines of a figure have a colour: the user's own, the paper's algorithm, the reference, the bound, the best
-learned and the best classical competitor, then the others by their cost; the rest is grey. Policies and estimators are
-solid, smoothers dash-dotted, references dashed, bounds dotted, in every figure.
+At most six lines of a figure have a colour (:func:`.looks.choose_highlights`); the rest is grey. Policies and
+estimators are solid, smoothers dash-dotted, references dashed, bounds dotted, in every figure.
 """
 
 import textwrap
@@ -49,13 +48,12 @@ def _abscissa(curves: xarray.Dataset) -> numpy.ndarray:
 
 
 def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
-    """Set the limits of the time axis from just before the first measurement to the last, or around a single one."""
     first, last = float(x[0]), float(x[-1])
     axis.set_xlim(*((first - 0.01 * (last - first), last) if last > first else (0.5 * first, 1.5 * first)))
 
 
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
-    """Label the time axis: seconds below and measurements above, or without constant interval only measurements."""
+    """Label the time axes: seconds below and measurement numbers above, where the interval is constant."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
@@ -71,7 +69,7 @@ def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
 
 
 def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
-    """Shade the scenario's windows and write their names at the top, except those that span the whole episode."""
+    """Shade the scenario's windows, except those that span the whole episode, and write their names."""
     length, x = curves.sizes["time"], _abscissa(curves)
     step = 0.5 * (x[1] - x[0]) if length > 1 else 0.5
     shown = {name: ends for name, ends in windows_of(curves).items() if ends[1] - ends[0] + 1 < 0.85 * length}
@@ -103,7 +101,7 @@ def _over_time(
     columns: int,
     finish: Callable[[Any, CurvePanel], None],
 ) -> Any:
-    """Return a figure of lines over time in panels one above the other; lines without a style are grey."""
+    """Return a figure of panels one above the other with lines over time; lines without a style are grey."""
     from matplotlib.lines import Line2D
 
     names = curves["policy"].values.tolist()
@@ -162,7 +160,7 @@ def _draw_bands(
     distinct: Iterable[str],
     look: Mapping[str, Mapping[str, Any]],
 ) -> bool:
-    """Draw the bands about lines, except those over a third of the axis; return whether some were left out."""
+    """Draw the bands of lines, except those over a third of the axis; return whether some were left out."""
     left_out = False
     if panel.low is None or panel.high is None:
         return left_out
@@ -235,7 +233,7 @@ def draw_error_over_time(
 def draw_cost_difference(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Return a figure of mean costs over time minus those of the paper's algorithm and of the best; bands are paired.
+    """Return a figure of mean costs minus those of the paper's algorithm and of the best; bands are paired.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -302,7 +300,7 @@ def draw_consistency(
 def draw_error_distribution(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Return a figure of the share of measurements with an error above a given size, for every quantity.
+    """Return a figure of the share of measurements whose error exceeds each size, for every quantity.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -346,7 +344,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return policies whose mode probabilities vary by over 0.02, each with those that have equal probabilities."""
+    """Return policies whose mode probabilities vary by over 0.02, grouped by equal probabilities."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values
@@ -432,10 +430,10 @@ def evaluation_figures(
     Args:
         curves: curves of an evaluation, from :func:`.curves.curves_of`.
         columns: width of the figures in columns of a paper, 1 or 2.
-        highlight: names of the coloured lines, at most six; default: as in :func:`choose_highlights`.
+        highlight: names of the coloured lines; default: :func:`choose_highlights`.
         learned: names of learned competitors.
         own: names of the user's competitors.
-        points: points of cost and time, see :func:`.times.points_of_records`; without points there is no such figure.
+        points: points of cost and time, see :func:`.times.points_of_records`.
 
     Raises:
         ValueError: for another number of columns, unknown names, or too many.

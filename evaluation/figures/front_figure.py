@@ -51,14 +51,14 @@ class FrontPanel(NamedTuple):
 
     @property
     def top(self) -> float:
-        """Highest cost that is drawn, %."""
+        """Highest cost that is drawn, relative to the paper's algorithm, %."""
         ranked = [point for point in self.points if point.kind in RANKED or point.name == self.reference]
         usual = min(max((point.cost for point in ranked), default=0.0), _percent(MOST_ABOVE))
         return max([usual, *(point.cost for point in ranked if point.name in self.own)])
 
     @property
     def beyond(self) -> list[Point]:
-        """Points with a higher cost than ``top``, which are not drawn."""
+        """Ranked competitors whose cost is too high to be drawn."""
         return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
@@ -93,7 +93,7 @@ def draw_front(
 
 
 def draw_panel(axis: Any, panel: FrontPanel) -> None:
-    """Draw a panel's points, the Pareto front and the reference, without labels."""
+    """Draw the competitors of one panel, their Pareto front and the reference, without labels."""
     axis.set_title(panel.title, loc="left")
     axis.set_xscale("log")
     axis.set_yscale("function", functions=(_octaves, _percent))
@@ -124,7 +124,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
 
 
 def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
-    """Return legend handles for the kinds of points and lines in some panels."""
+    """Return legend handles for the kinds of competitors and lines in some panels."""
     from matplotlib.lines import Line2D
 
     shown = [(point, panel) for panel in panels for point in panel.points if point.kind in RANKED]
@@ -143,25 +143,17 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
 
 
 def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
-    """Write labels in free places: of the paper's algorithm, the user's competitors, the front and the reference.
-
-    Args:
-        figure: figure with a complete layout.
-        panels: panels by their axes.
+    """Write the names of the paper's algorithm, the user's competitors, the front and the reference in free
+    places.
     """
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # names must not move the axes
     for axis, panel in panels.items():
-        _Names(figure, axis).place(panel)
+        _NamePlacement(figure, axis).place(panel)
 
 
-class _Names:
-    """Placement of labels in one pair of axes, in pixels.
-
-    Args:
-        figure: figure of the axes.
-        axis: axes with their limits set.
-    """
+class _NamePlacement:
+    """Placement of competitors' names in one pair of axes, in pixels, in free places."""
 
     def __init__(self, figure: Any, axis: Any) -> None:
         self.figure, self.axis = figure, axis
@@ -175,7 +167,7 @@ class _Names:
         """Points along lines, ``(n, 2)`` each, pixels."""
 
     def place(self, panel: FrontPanel) -> None:
-        """Write all labels of a panel."""
+        """Write all names of a panel."""
         on_front = _on_front(panel)
         low, high = self.axis.get_ylim()
         shown = [p for p in panel.points if p.kind in RANKED and low <= p.cost <= high]
@@ -228,7 +220,7 @@ class _Names:
         return float(box.width), float(box.height)
 
     def _name_line(self, point: Point, y: float) -> None:
-        """Write the label of the reference on its line, at the less crowded end."""
+        """Write the reference's name on its line, at the less crowded end."""
         width, height = self._extent(point.name)
         gap = 2.0 * self.pixels
         boxes = [
@@ -241,7 +233,7 @@ class _Names:
         self._write(point.name, best, "black")
 
     def _find_place(self, point: Point, always: bool) -> tuple[Box, float] | None:
-        """Return and reserve the best box for a point's label, with its penalty; None without a free place."""
+        """Reserve the best box for a point's name; return it with its penalty, or None without a free place."""
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
         k = numpy.arange(DIRECTIONS)
@@ -268,7 +260,7 @@ class _Names:
         return box, float(badness[best])
 
     def _name(self, point: Point, box: Box, colour: str) -> None:
-        """Write a label into its box, with a line to its point if that is not near."""
+        """Write a name into its box, with a line to its point if that is not near."""
         x, y = self._at(point.time.nanoseconds, point.cost)
         end = _nearest(box, (x, y))
         if math.dist((x, y), end) > 6.5 * self.pixels:
@@ -277,7 +269,7 @@ class _Names:
         self._write(point.name, box, colour)
 
     def _crosses(self, start: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return a mask of boxes for which the line from the point to the box crosses another label or point."""
+        """Return a mask of boxes whose line to the point crosses another name or point."""
         ends = numpy.clip(numpy.array(start), boxes[:, :2], boxes[:, 2:])
         x, y = numpy.linspace(numpy.broadcast_to(start, ends.shape), ends, 12, axis=1).T[..., None]
         a, b, c, d = numpy.array(self.points + self.names).reshape(-1, 4).T
@@ -286,7 +278,7 @@ class _Names:
         return found
 
     def _is_nearer(self, point: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return a mask of boxes for which a label is ambiguous, since another point is about as near."""
+        """Return a mask of boxes that are about as near to another point, so that a name there is ambiguous."""
         taken = numpy.array(self.points)
         centres = 0.5 * (taken[:, :2] + taken[:, 2:])
         apart = numpy.linalg.norm(centres - point, axis=1) > 5.0 * self.pixels
@@ -296,7 +288,7 @@ class _Names:
         return nearer
 
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return the weighted overlap of each box with lines, points, labels and the frame, in order of weight."""
+        """Return the weighted overlap of each box with names, points, lines and the frame."""
         left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
         found = numpy.zeros(len(boxes))
@@ -331,17 +323,17 @@ class _Names:
 
 
 def _nearest(box: Box, point: tuple[float, float]) -> tuple[float, float]:
-    """Return the coordinates of the point of a box that is nearest to another point."""
+    """Return the point of a box that is nearest to another point."""
     return min(max(point[0], box[0]), box[2]), min(max(point[1], box[1]), box[3])
 
 
 def _unit(cosine: numpy.ndarray) -> numpy.ndarray:
-    """Return the offset of a box's centre as a multiple of half its size, -1 to 1, for a direction."""
+    """Return the offset of a box's centre over half its size, -1 to 1, in the direction of a cosine."""
     return numpy.clip(1.8 * cosine, -1.0, 1.0)
 
 
 def _octaves(percent: Any) -> Any:
-    """Return the binary logarithm of the ratio of a cost to the paper's, from their relative difference in %."""
+    """Return log2(cost / cost of the paper), from their relative difference in %."""
     return numpy.log2(numpy.maximum(1.0 + numpy.asarray(percent) / 100.0, 1e-6))
 
 
@@ -386,7 +378,7 @@ def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
 
 
 def _label_axes(axis: Any, panel: FrontPanel) -> None:
-    """Draw ticks and titles of the axes, and the number of points above the upper limit."""
+    """Draw ticks and titles of the axes, and the number of competitors above the upper limit."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
     low, high = (float(_octaves(end)) for end in axis.get_ylim())

@@ -21,7 +21,7 @@ MOST_HIGHLIGHTED = 6
 
 
 def styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    """Return a mapping from each name to its colour and line style, all different."""
+    """Return a colour and line style for each name, all different."""
     n = len(COLOURS)
     return {
         name: {"color": COLOURS[i % n], "linestyle": LINES[(i // n) % len(LINES)], "linewidth": 1.6}
@@ -30,9 +30,9 @@ def styles(names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Return a list of the names of the ranked competitors, ordered by mean cost, the lowest first.
+    """Return the names of the ranked competitors by mean cost, the lowest first.
 
-    Without costs the order is by the mean RMSE of the first quantity, and without truth that of the evaluation.
+    Without costs it is by the mean RMSE of the first quantity, without truth unchanged.
     """
     names = curves["policy"].values[numpy.isin(curves["kind"].values.astype(str), RANKED)].tolist()
     if "mean_cost" in curves:
@@ -51,7 +51,7 @@ def choose_highlights(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> list[str]:
-    """Return a list of the names of the lines to highlight, the most important first; of equal lines the first.
+    """Return the names of the lines to highlight, the most important first.
 
     Args:
         curves: curves of an evaluation.
@@ -96,7 +96,9 @@ def choose_highlights(
 
 
 def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
-    """Return whether two lines agree within a relative 1e-6, with NaN in the same places; False if all are NaN."""
+    """Return whether two lines agree within a relative 1e-6, with NaN in the same places; False if all are
+    NaN.
+    """
     missing = numpy.isnan(one).all() and numpy.isnan(other).all()
     return not missing and bool(numpy.allclose(one, other, rtol=1e-6, atol=0.0, equal_nan=True))
 
@@ -107,13 +109,11 @@ def looks(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Return a mapping from the name of each highlighted line to its colour, line style and width.
-
-    The order is that of the legend.
+    """Return colour, line style and width of each highlighted line by name, in the order of the legend.
 
     Args:
         curves: curves of an evaluation.
-        highlight: names to highlight; default: as in :func:`choose_highlights`.
+        highlight: names to highlight; default: :func:`choose_highlights`.
         learned: names of learned competitors; their lines are thicker.
         own: names of the user's competitors; their lines are thicker, and the first has its own colour.
     """
@@ -150,7 +150,7 @@ def looks(
 
 
 def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
-    """Return a mapping from the first name of each group of equal lines to all names of the group."""
+    """Group names whose lines are equal, by the first name of each group."""
     found: dict[str, list[str]] = {}
     for name in names:
         twin = next((first for first in found if _same(values[first], values[name])), name)
@@ -161,13 +161,8 @@ def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray])
 def distinguish_lines(
     look: Iterable[str], values: Mapping[str, numpy.ndarray]
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the labels of the highlighted lines by name, and the names of the others.
-
-    A label contains the names of all equal lines.
-
-    Args:
-        look: names of the highlighted lines, in the order of the legend.
-        values: line of each name.
+    """Return a label for each group of equal lines that is highlighted, by its first name, and the other
+    lines' names.
     """
     chosen = list(look)
     groups = group_equal_lines(

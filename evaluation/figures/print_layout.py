@@ -21,14 +21,14 @@ DOTS_PER_INCH = 200
 
 
 def check_columns(columns: int) -> int:
-    """Return a figure's number of columns unchanged, or raise ValueError if it is not 1 or 2."""
+    """Return the width of a figure in columns unchanged; raise ValueError if it is not 1 or 2."""
     if columns not in WIDTHS:
         raise ValueError(f"a figure is 1 or 2 columns wide, got {columns}")
     return columns
 
 
 def check_formats(formats: Iterable[str]) -> list[str]:
-    """Return a list of the file formats without repetitions, or raise ValueError for an unsupported one."""
+    """Return the file formats without repetitions; raise ValueError for an unsupported one."""
     for each in formats:
         if each not in FORMATS:
             raise ValueError(
@@ -77,7 +77,7 @@ def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = Non
 
 
 def figure_with_pairs(rows: int, columns: int = 2) -> Any:
-    """Return an empty figure and its axes, two in every row, ``(rows, 2)``."""
+    """Return an empty figure and its axes, two in each of some rows, ``(rows, 2)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -87,7 +87,7 @@ def figure_with_pairs(rows: int, columns: int = 2) -> Any:
 
 
 def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
-    """Add a title and a legend to a figure and return it; the legend is beside the title where it fits, else below."""
+    """Add a title and a legend, beside the title where it fits, else below; return the figure."""
     width = figure.get_figwidth()
     size = FONT_SIZES[1 if width < 5.0 else 2]
     # Letters are a little wider than half their height.
@@ -112,10 +112,7 @@ def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> 
 
 
 def logarithmic(axis: Any) -> None:
-    """Set the tick labels of a logarithmic axis, whose limits are set, to plain numbers.
-
-    Labels are at decades; over three decades also at 2 and 5, over one also at 3, over half of one at round numbers.
-    """
+    """Set plain numbers as tick labels of a logarithmic axis, whose limits are set."""
     from matplotlib.ticker import MaxNLocator, NullLocator
 
     low, high = axis.get_view_interval()
@@ -133,10 +130,10 @@ def sensible_limits(
     always: Sequence[numpy.ndarray] = (),
     bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
-    """Return lower and upper limit of a logarithmic axis, which one line or a transient does not determine.
+    """Return the limits of a logarithmic axis that neither one line nor a transient determines.
 
-    A line extends the limits from its 5th percentile, so that it need not begin at zero, to its largest value, but at
-    most a factor of six above half of the lines.
+    A line extends them from its 5th percentile to its largest value, at most six times the median of the
+    largest values.
 
     Args:
         lines: positive values; NaN where there is none.
@@ -158,13 +155,13 @@ def sensible_limits(
 
 
 def positive(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the finite positive values of an array, which a logarithmic axis can show."""
+    """Return the finite positive values of an array."""
     found: numpy.ndarray = values[numpy.isfinite(values) & (values > 0.0)]
     return found
 
 
 def _spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Return places in [0, 1] near the desired ones, with at least a gap between them."""
+    """Return places in [0, 1] near the desired ones, at least a gap apart."""
     order = numpy.argsort(wanted, kind="stable")
     places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
     for _ in range(200):
@@ -183,7 +180,7 @@ def _spread(wanted: Sequence[float], gap: float) -> list[float]:
 
 
 def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float, Any]], rows: int) -> None:
-    """Write labels of lines at their right ends, beside the axes.
+    """Write labels of lines beside the axes, at the lines' right ends.
 
     Args:
         figure: figure of the axes.
@@ -211,24 +208,21 @@ def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float,
 
 
 def room_for_labels(labels: Iterable[str], columns: int) -> bool:
-    """Return whether labels fit beside the axes, within a third of the width and the height of the lowest axes."""
+    """Return whether labels fit beside axes, at their number and length."""
     labels = list(labels)
     width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
     return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
 
 
 def wrap_label(label: str, columns: int) -> str:
-    """Return a label of an ordinate with line breaks, so that it fits the height of a panel."""
+    """Return an axis label with line breaks, so that it fits the height of a panel."""
     return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
 
 
 def save(figure: Any, path: Path) -> None:
     """Write a figure to a file atomically, in the format of its suffix.
 
-    Formats are ``.png``; ``.svg``, with text as text; ``.pdf``, with embedded fonts. Equal figures give equal files.
-
-    Raises:
-        ValueError: for another suffix, or if it cannot be written.
+    Formats are ``.png``, ``.svg`` and ``.pdf``. Equal figures give equal files.
     """
     from matplotlib import rc_context
 

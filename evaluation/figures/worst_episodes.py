@@ -46,12 +46,7 @@ class WorstEpisode(NamedTuple):
 
 
 def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
-    """Return the numbers of the episodes with the highest cost, the highest first.
-
-    Args:
-        costs: mean cost of every episode; one that is NaN is left out.
-        most: maximal number of episodes.
-    """
+    """Return the numbers of the episodes with the highest costs, the highest first, without NaN."""
     order = numpy.argsort(-costs, kind="stable")
     return [int(i) for i in order[:most] if not numpy.isnan(costs[i])]
 
@@ -59,16 +54,7 @@ def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
 def run_episodes(
     experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
 ) -> xarray.Dataset:
-    """Run some episodes of an experiment again; return their dataset with the data for figures.
-
-    Args:
-        experiment: experiment of the episodes.
-        competitors: competitors by name, as for :func:`.evaluate.run_experiment`.
-        numbers: numbers of the episodes.
-
-    Returns:
-        Dataset of these episodes, in their order, as from :func:`.evaluate.run_experiment`.
-    """
+    """Run some episodes of an experiment again, with the data for figures; return their dataset."""
     drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
     plan = _with_episodes(plan_of(drawn, competitors), numbers)
     kept = plan.arrays(len(numbers), len(numbers))
@@ -86,14 +72,7 @@ def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
 def describe_worst(
     dataset: xarray.Dataset, numbers: list[int], name: str, opponent: str = ""
 ) -> list[WorstEpisode]:
-    """Return costs, seed and main causes of some episodes of a competitor.
-
-    Args:
-        dataset: evaluation from :func:`run_episodes`.
-        numbers: numbers of its episodes.
-        name: name of the competitor.
-        opponent: competitor with which it is compared; empty: none.
-    """
+    """Return costs, seed and main causes of some episodes of a competitor."""
     own = mean_cost(dataset, name)
     other = mean_cost(dataset, opponent) if opponent else numpy.full(len(numbers), numpy.nan)
     causes = main_causes(dataset.sel(policy=name))
@@ -105,13 +84,10 @@ def describe_worst(
 
 
 def main_causes(run: xarray.Dataset) -> list[list[str]]:
-    """Return a list of the names of each episode's main causes, by weight (:func:`.cause_split.reason_weight`).
-
-    Args:
-        run: one competitor's part of an evaluation.
+    """Return each episode's main causes of cost, the heaviest first (:func:`.cause_split.reason_weight`).
 
     Returns:
-        At most ``MOST_CAUSES`` for each; none where no cause has ``LEAST_WEIGHT``.
+        At most ``MOST_CAUSES`` names for each, with at least ``LEAST_WEIGHT``.
     """
     if VARIABLE not in run:
         return [[] for _ in range(run.sizes["episode"])]
@@ -138,7 +114,7 @@ def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
 def draw_worst(
     tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2
 ) -> Any:
-    """Return a figure of episodes, one in each row: true and estimated positions of the target, and the error.
+    """Return a figure of a competitor's episodes, a row each: true and estimated positions, and the error.
 
     Args:
         tracks: track of each episode, with ``truth``, optionally ``seen``, ``estimate`` and ``sigma`` over policy,
@@ -170,7 +146,7 @@ def draw_worst(
 
 
 def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str], name: str) -> None:
-    """Draw true, measured and estimated positions in the plane, or the first component over time."""
+    """Draw true, measured and estimated positions in the plane, or of the first component over time."""
     plane = bool(track.attrs["plane"])
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
 
@@ -201,7 +177,7 @@ def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]
 
 
 def _draw_errors(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]) -> None:
-    """Draw the size of the error in the plane or of the first component over time, and two reported sigmas."""
+    """Draw the size of the position error over time, and two reported standard deviations."""
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
     drawn = track.isel(component=slice(2 if track.attrs["plane"] else 1))
     for one in reversed([str(n) for n in track["policy"].values]):

@@ -1,5 +1,5 @@
 """Evaluations: competitors side by side on identical noise, their times, records, curves and summaries.
 
-It imports the rooms before it and draws no figures. Begin with :mod:`.evaluate`; below it :mod:`.rollout` runs the
-episodes of one competitor, and :mod:`.summary` reduces them block by block.
+Begin with :mod:`.evaluate`; below it :mod:`.rollout` runs the episodes of one competitor, and :mod:`.summary`
+reduces them block by block.
 """

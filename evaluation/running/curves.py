@@ -1,8 +1,7 @@
 """Curves of an evaluation over time, by competitor: the data of all its figures.
 
-Bands of ``rmse``, mode and true-class probabilities are 95 % percentile bootstraps over episodes (Efron and Tibshirani:
-An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fly several. After the end of shorter
-flights their missing values are left out.
+Bands of ``rmse``, mode and true-class probabilities are 95 % percentile bootstraps over episodes (Efron and
+Tibshirani: An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fly several.
 """
 
 import functools
@@ -52,15 +51,15 @@ Series = tuple[tuple[str, ...], numpy.ndarray]
 
 @one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
-    """Return the data of an evaluation's figures: errors, consistency and actions over time, costs by stretch.
+    """Return the data of an evaluation's figures, such as errors and consistency over time, and costs by
+    stretch.
 
     Args:
         dataset: evaluation, in memory or read from a file; also with some of its policies only.
         resamples: number of bootstrap resamples.
 
     Returns:
-        Variables over policy and time, of 64-bit floats; NaN where a competitor has none, and absent where no
-        competitor has:
+        Variables over policy and time; NaN where a competitor has none, absent where no competitor has:
 
         * ``rmse`` (policy, quantity, time), in the unit of the quantity, with ``rmse_low`` and ``rmse_high``: root of
           the mean square error over episodes;
@@ -75,7 +74,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           gains that a bank records, with the same percentiles;
         * ``mean_cost`` (policy): mean over episodes;
         * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less
-            that of the paper's algorithm and of the best ranked competitor, paired, with ``_low`` and ``_high``.
+          that of the paper's algorithm and of the best ranked competitor, paired, with ``_low`` and ``_high``.
 
         Exceeded errors, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
         256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``nanoseconds`` and
@@ -97,7 +96,7 @@ def evenly_spaced(count: int, most: int) -> numpy.ndarray:
 
 
 class CompetitorCurves(NamedTuple):
-    """Curves of one competitor, and the names of its actions and gains."""
+    """Curves of one competitor over time by name, and the names of its actions and gains."""
 
     curves: dict[str, numpy.ndarray]
     actions: list[str]
@@ -107,7 +106,7 @@ class CompetitorCurves(NamedTuple):
     None for bounds, and without truth."""
 
     def at_measurements(self, indices: numpy.ndarray, times: int) -> "CompetitorCurves":
-        """Return the curves with only the measurements of these indices, out of ``times``."""
+        """Select some of ``times`` measurements in all curves over time."""
         over_time = {key for key, own in self.curves.items() if own.shape[-1:] == (times,)}
         fewer = {key: own[..., indices] if key in over_time else own for key, own in self.curves.items()}
         return self._replace(curves=fewer)
@@ -127,7 +126,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
-    """Return the names of quantities with known truth: groups of components, or the first three components."""
+    """Return the quantities with known truth: groups of components, or else the first three components."""
     reported = list(components_and_groups(dataset))
     return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
@@ -135,13 +134,7 @@ def select_quantities(dataset: xarray.Dataset) -> list[str]:
 def curve_statistics(
     run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
 ) -> Iterator[Statistic]:
-    """Yield the statistics needed for a competitor's curves, as declarations (:class:`.Statistic`).
-
-    Args:
-        run: some episodes of one competitor.
-        episodes: number of episodes of the whole evaluation.
-        resamples: number of resamples for the bands.
-    """
+    """Yield the statistics of one competitor's curves as declarations, for some of its episodes."""
     times = run.sizes["time"]
     resamples = resamples if episodes > 1 else 0  # one episode has no variation over episodes
     distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
@@ -193,13 +186,7 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
 def stack_curves(
     competitors: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int
 ) -> xarray.Dataset:
-    """Return the curves of several competitors as one dataset, see :func:`curves_of`.
-
-    Args:
-        competitors: curves in the order of the policies of the evaluation.
-        dataset: the evaluation, of which only coordinates and attributes are needed.
-        episodes: number of episodes of the curves.
-    """
+    """Combine the curves of several competitors into one dataset, see :func:`curves_of`."""
     units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
         "action_name": list(dict.fromkeys(name for each in competitors for name in each.actions)),
@@ -264,27 +251,23 @@ def stack_curves(
 
 
 def stretches_of(times: int) -> list[slice]:
-    """Return the slices of at most ``MOST_STRETCHES`` stretches of an episode; the last may be shorter.
-
-    Args:
-        times: number of its measurements.
+    """Divide an episode of ``times`` measurements into at most ``MOST_STRETCHES`` slices; the last may be
+    shorter.
     """
     length = -(-times // MOST_STRETCHES)
     return [slice(first, min(first + length, times)) for first in range(0, times, length)]
 
 
 def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean cost in each stretch of every episode, ``(episodes, stretches)``; NaN where it has no cost.
-
-    Args:
-        cost: ``(episodes, time)``; NaN where there is none.
+    """Return the mean cost in each stretch of every episode, ``(episodes, stretches)``; NaN where there is
+    none.
     """
     means = [ratio(sums_of_present(cost[:, stretch])) for stretch in stretches_of(cost.shape[1])]
     return numpy.stack(means, axis=1)
 
 
 def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Return the middle of each stretch as coordinates: measurement number, and seconds for constant intervals."""
+    """Return the middle of each stretch as dataset coordinates: measurement number, and seconds if regular."""
     middles = {
         name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
         for name in ("time", "elapsed")
@@ -310,13 +293,7 @@ def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str
 def _cost_differences(
     found: Sequence[CompetitorCurves], names: Sequence[str], bases: Mapping[str, str]
 ) -> dict[str, Series]:
-    """Return the dataset variables of mean costs over time minus those of other competitors, paired, with bands.
-
-    Args:
-        found: curves in the order of the names.
-        names: names of the competitors.
-        bases: name of each other competitor, by the ending of the variable's name.
-    """
+    """Return dataset variables of mean costs over time minus those of other competitors, paired, with bands."""
     variables: dict[str, Series] = {}
     for key, base in bases.items():
         theirs = found[names.index(base)].costs if base in names else None
@@ -332,7 +309,7 @@ def _cost_differences(
 
 
 def gains_of(dataset: xarray.Dataset) -> list[str]:
-    """Return the names of the dataset's variables that are gains of a bank, one number for every measurement."""
+    """Return the names of the dataset's gains of a bank, one number for every measurement."""
     names = map(str, dataset.data_vars)
     return [
         name
@@ -348,10 +325,8 @@ def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
     """Return the size of error that each share :data:`SHARES` of the errors reaches or exceeds, ``(shares,)``.
 
     Args:
-        errors: non-negative errors of any shape; NaN is left out.
-
-    Returns:
-        ``(shares,)``; NaN where the share is less than one error.
+        errors: non-negative errors of any shape; NaN is left out, and the result for a share of less than one
+            error.
     """
     descending = -numpy.sort(-errors, axis=None)  # NaN comes last
     count = int(numpy.isfinite(descending).sum())
@@ -363,10 +338,9 @@ def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
 
 
 def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
-    """Return the dataset variables of the 95 % bands of ANEES and ANIS for a consistent filter.
+    """Return the 95 % bands of ANEES and ANIS over time for a consistent filter, as dataset variables.
 
-    A sum of independent chi-square numbers is chi-square with the sum of their degrees (Bar-Shalom, Li, Kirubarajan:
-    Estimation with Applications to Tracking and Navigation, 2001, 5.4).
+    Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4.
     """
     variables: dict[str, Series] = {}
     for key in ("anees", "anis"):
@@ -411,5 +385,5 @@ def _exceedance(squares: numpy.ndarray) -> Curve:
 
 
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
-    """Return the ANEES or ANIS and the sum of dimensions over time, from the means of both sums, ``(1, 2, time)``."""
+    """Return ANEES or ANIS and the sum of dimensions over time, from episode means of both, ``(1, 2, time)``."""
     return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}

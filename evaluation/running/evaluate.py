@@ -28,24 +28,23 @@ from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .metrics import bootstrap_of, units_of
+from .metrics import bootstrap_of, time_units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
-from .rollout import ProcessorTime, Progress, measure_time, run_episodes
+from .rollout import Progress, measure_time, run_episodes
 from .seeds import episode_seeds
 from .stored_values import StoredValues, bound_values
 from .supervision import report_running
 from .threads import one_thread
-from .times import with_times
+from .times import ProcessorTime, with_times
 
 if TYPE_CHECKING:
     import xarray
 
 
 def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the name of the control (the quantity that actions change) in which a competitor runs.
-
-    It is the policy's own, or one whose spaces fit those of a learned model.
+    """Return the control in which a competitor runs: its own, one whose spaces fit a learned model, or the
+    first.
 
     Args:
         maker: maker of the competitor, or the competitor itself.
@@ -81,7 +80,7 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
 
 
 def check_observation(model: Model, policy: Any, name: str) -> None:
-    """Raise ValueError if a learned policy expects observations of another shape, or privileged ones."""
+    """Raise ValueError if a learned policy expects observations of another shape, or privileged ones (truth)."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
         raise ValueError(
@@ -123,17 +122,17 @@ class Experiment:
     control: str | None = None
     """Name of the control in which all policies run; None: every policy runs in its own."""
     tracks: bool = False
-    """Whether to store the data for plots of tracks, see :meth:`.Task.track`; they need memory."""
+    """Whether to store the data for plots of tracks, see :meth:`.Model.track`; they need memory."""
     drawn_episodes: int = 0
-    """Number of first episodes with data for pictures, :meth:`.Task.drawn`: variables ``drawn_estimate`` and so on,
-    over policy, drawn_episode and time.
+    """Number of first episodes with data for pictures, :meth:`.Model.picture_track`: variables ``drawn_estimate``
+    and so on, over policy, drawn_episode and time.
     """
     paper: str = ""
     """Name of the paper's algorithm, whose score is 0; stored in the attributes of the evaluation."""
     reference: str = ""
     """Name of the competitor whose score is 1; stored in the attributes of the evaluation."""
     backend: str = "auto"
-    """Backend of the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, "auto", "compiled" or "numpy"; see :func:`.engine.backend.make_model`."""
     threads: int = 1
     """Number of threads that share the episodes, with the compiled backend."""
     strict: bool = False
@@ -150,14 +149,11 @@ class Experiment:
         return _experiment_on, (importable_name(self.task), others)
 
     def make_task(self) -> Task:
-        """Return the task of the environment, with the scenario and the parameters."""
+        """Make the environment's task, with the scenario and the parameters."""
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Return the model (task, bank and control) in which a competitor runs.
-
-        The experiment's keywords override those that the competitor was tuned with.
-        """
+        """Make the model (task, bank and control) in which a competitor runs."""
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
         return make_model(
             self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords
@@ -165,7 +161,7 @@ class Experiment:
 
 
 def _experiment_on(name: str, others: Mapping[str, Any]) -> Experiment:
-    """Return an experiment on the environment of this name, from the other fields; for unpickling."""
+    """Make an experiment on the environment of this name, when it is unpickled."""
     return Experiment(task_class(name), **others)
 
 
@@ -198,15 +194,16 @@ def run_experiment(
         are NaN. The attribute ``notes`` lists omissions. For a recording ``flight`` names the episode of the recording.
         Without truth there are neither ``error``, ``cost``, ``compressed_cost`` nor ``nees``. Where the truth of some
         components is unknown, their errors are NaN, ``nees`` and ``nees_degrees`` are those of the other components,
-        and ``truth_known`` marks these. ``to_netcdf`` saves it; :mod:`.evaluation.storage.dataset` reads its windows,
-        groups and keywords.
+        and ``truth_known`` marks these.
 
     Raises:
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
             the control.
     """
     dataset = run_competitors(experiment, competitors, progress, workers)
-    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
+    if time_units_of(dataset) is not None and isinstance(
+        bootstrap := bootstrap_of(dataset, 0), BlockBootstrap
+    ):
         dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     return dataset
 
@@ -217,7 +214,7 @@ def run_competitors(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> "xarray.Dataset":
-    """Return the dataset of :func:`run_experiment`, without its note on intervals of a single episode."""
+    """Run competitors as :func:`run_experiment`, without its note on intervals of a single episode."""
     if progress is not None and not callable(progress):
         raise ValueError(
             f"progress must be a function of the number of measurements done, got {quote_shortened(progress)}"
@@ -243,7 +240,7 @@ def run_competitors(
 
 
 class Piece(NamedTuple):
-    """Some episodes of one competitor as a unit of parallel work: plain data for any process."""
+    """Some episodes of one competitor as a unit of parallel work, which another process can run."""
 
     experiment: Experiment
     name: str
@@ -268,7 +265,9 @@ LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``."""
+    """Run some episodes of one competitor; return the values at all measurements by name,
+    ``(episodes, time, ...)``.
+    """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = StoredValues(experiment.tracks), None
@@ -306,7 +305,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
-    """Raise ValueError if a task records a value under the name ``action`` or ``lost``."""
+    """Raise ValueError if a task records a value under a reserved name, ``action`` or ``lost``."""
     for taken in {"action", "lost"} & found.keys():
         raise ValueError(
             f"{model.task.id} records a value named {taken!r}, a name that an evaluation uses for "
@@ -315,7 +314,7 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
 
 
 class Plan(NamedTuple):
-    """Prepared evaluation: its episodes and models, from checked arguments."""
+    """Prepared evaluation with checked arguments: its episodes, and the model of every competitor."""
 
     experiment: Experiment
     """The experiment; its scenario is read from files."""
@@ -332,7 +331,7 @@ class Plan(NamedTuple):
     lengths: numpy.ndarray | None
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
-        """Return some episodes of a competitor as a unit of parallel work; ``here``: with its model."""
+        """Return some episodes of a competitor as a unit of work; ``here``: with its model, for this process."""
         model = self.models[name]
         return Piece(
             self.experiment,
@@ -347,12 +346,14 @@ class Plan(NamedTuple):
         )
 
     def time(self, name: str) -> ProcessorTime | None:
-        """Return the measured processor time of a competitor, see :func:`.rollout.measure_time`."""
+        """Measure a competitor's processor time for a measurement; None where :func:`.rollout.measure_time`
+        gives none.
+        """
         with report_running(name, timed=False):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
-        """Return preallocated arrays for the values of all competitors in some episodes."""
+        """Return preallocated arrays for all competitors' values in some episodes."""
         acting = [
             name
             for name, model in self.models.items()
@@ -361,7 +362,7 @@ class Plan(NamedTuple):
         return StackedArrays(self.models, acting, episodes, drawn)
 
     def dataset(self, arrays: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
-        """Return the dataset of an evaluation from the arrays of values and the seeds of their episodes."""
+        """Return the dataset of an evaluation from its arrays and the seeds of the episodes."""
         experiment = self.experiment
         dataset = with_named_axes(arrays, self.kinds, self.models, self.scenario.windows, seeds)
         if self.flight_numbers is not None and self.lengths is not None:
@@ -397,12 +398,10 @@ class Plan(NamedTuple):
 def plan_of(
     experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
 ) -> Plan:
-    """Check the arguments of an evaluation; return its episodes, models and kinds of competitors.
-
-    Errors as of :func:`run_experiment`.
+    """Check the arguments of an evaluation; return its episodes, and each competitor's model and kind.
 
     Args:
-        experiment: the episodes and options.
+        experiment: the experiment.
         competitors: competitors by name.
         first: number of the first planned episode; for flights and recordings all episodes are planned.
         end: number after the last planned episode; None with ``first=0``: all.
@@ -460,12 +459,7 @@ def plan_of(
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
-    """Raise ValueError for a task or competitor that another process cannot import or unpickle.
-
-    Args:
-        task: task class of the environment.
-        competitors: competitors by name.
-    """
+    """Raise ValueError for a task or competitor that cannot be imported or unpickled in another process."""
     if importable_name(task).startswith("__main__:"):
         raise ValueError(
             f"{task.id} is registered by the running program, which other processes do "
@@ -483,7 +477,7 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often, at least once."""
+    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often."""
     count = len(model.task.flights)
     share = -(-episodes // count)
     found: list[int] = []

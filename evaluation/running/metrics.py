@@ -48,7 +48,7 @@ NEGLIGIBLE = 5e-5
 
 
 class Record(NamedTuple):
-    """One statistic of one competitor over one window, with its 95 % interval."""
+    """One statistic of one competitor over one window, with its 95 % interval: a row of the results."""
 
     environment: str
     control: str
@@ -72,7 +72,7 @@ class Record(NamedTuple):
 def squared_errors(
     run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
 ) -> numpy.ndarray:
-    """Return the squared errors of a component or group in one run, ``(episodes, time)``; for bounds the mean ones."""
+    """Return squared errors of a component or group, ``(episodes, time)``; of a bound its mean square errors."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
         return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
@@ -80,7 +80,7 @@ def squared_errors(
 
 
 def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return a mapping from each component and group with known truth to its unit."""
+    """Return the unit of each component and group with known truth, by name."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
         known = dataset["truth_known"].values > 0
@@ -90,13 +90,7 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the sum and number of the values that are not NaN in every episode, ``(episodes, 2)``.
-
-    :func:`.bootstrap.ratio` gives their means.
-
-    Args:
-        values: ``(episodes, time)``; NaN stands for no measurement, or no event.
-    """
+    """Return sum and number of each episode's values that are not NaN, ``(episodes, 2)``."""
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
@@ -111,22 +105,20 @@ def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES)
 def cached_bootstrap(
     episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
 ) -> Bootstrap:
-    """Return the bootstrap over a number of episodes, or over clusters of them, from a cache."""
+    """Return the bootstrap over episodes, or over clusters of them; the last two are cached."""
     return Bootstrap(episodes, resamples, clusters=clusters)
 
 
-def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
-    """Return the division of one long episode into units of time; None for several episodes or a short one."""
+def time_units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
+    """Return the division of a single long episode into units of successive measurements; else None."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
     return None
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Return sums and numbers of one competitor's costs in units of time, ``(units, 2)``.
-
-    They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
-    known.
+    """Return sums and numbers of costs, or else log-likelihoods, in units of time, ``(units, 2)``; None
+    without both.
     """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
@@ -135,14 +127,14 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Return the bootstrap over blocks of one episode; the series of all competitors determine their length."""
+    """Return the bootstrap over blocks of one episode, whose length follows from the competitors' series."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
 
 def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Return the bootstrap over the episodes of an evaluation; for one episode over blocks of time."""
-    if (units := units_of(dataset)) is None:
+    """Return the bootstrap over the episodes of an evaluation, or of a single episode over blocks of time."""
+    if (units := time_units_of(dataset)) is None:
         return bootstrap_of_episodes(dataset, resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     return bootstrap_over_time(units, [sums_over_time(run, units) for run in runs], resamples)
@@ -161,24 +153,26 @@ class Reduced(NamedTuple):
     """The competitor's part of an evaluation, of which only coordinates and attributes are needed."""
 
     def without_variables(self) -> "Reduced":
-        """Return a copy without the values of the dataset, which saves memory."""
+        """Return a copy without the dataset's values, which saves memory."""
         run = self.run.drop_vars(list(self.run.data_vars))
         return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Return the sums and samples over one competitor's episodes, from which its records follow."""
+    """Reduce one competitor's episodes to the sums and samples from which its records follow."""
     # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
-    units = units_of(run)
+    units = time_units_of(run)
     series = None if units is None else sums_over_time(run, units)
     reduction = reduce_run(run, declare, units or bootstrap_of_episodes(run))
     return Reduced(reduction, units, series, list(prediction_measures(run)), run)
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Return the bootstrap over the episodes of a reduced evaluation; for one episode over blocks of time."""
+    """Return the bootstrap of a reduced evaluation: over episodes, or of a single episode over blocks of
+    time.
+    """
     if (units := reduced[0].units) is None:
         return bootstrap_of_episodes(evaluation)
     return bootstrap_over_time(units, [one.series for one in reduced])
@@ -187,13 +181,7 @@ def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset
 def records_of_reduced(
     reduced: Sequence[Reduced], evaluation: "xarray.Dataset", metrics: OwnMetrics | None = None
 ) -> list[Record]:
-    """Return all records of an evaluation, from its reduced competitors.
-
-    Args:
-        reduced: all competitors, from :func:`reduce_competitor`.
-        evaluation: dataset with the coordinates and attributes.
-        metrics: metrics of the environment; not used for recordings.
-    """
+    """Return all records of an evaluation from the sums and samples of its competitors."""
     own = None if evaluation.attrs.get("recorded") else metrics
     bootstrap = bootstrap_of_reduced(reduced, evaluation)
     blocks = bootstrap if isinstance(bootstrap, BlockBootstrap) else None
@@ -205,12 +193,7 @@ def records_of_reduced(
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
-    """Return the means over time of values ``(episodes, time)``; NaN beyond the end of a flight is left out.
-
-    Args:
-        run: part of the evaluation with the values.
-        values: ``(episodes, time)``; NaN beyond the end of a flight, or of a window that it does not reach.
-    """
+    """Return means over time of values ``(episodes, time)``; of flights without the NaN after their ends."""
     if "flight" not in run.coords:
         return values.mean(axis=1)
     return ratio(sums_of_present(values))
@@ -224,21 +207,12 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
-    """Yield the statistics needed for a competitor's records, as declarations (:class:`.Statistic`).
-
-    Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
-
-    Args:
-        run: some episodes of one competitor.
-        episodes: number of episodes of the whole evaluation.
-        metrics: metrics of the environment.
-    """
+    """Yield the statistics of one competitor's records as declarations, for some of its episodes."""
     groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
     judged = run.attrs.get("truth", True)
 
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
-        """Yield the statistic of a mean over time for each window."""
         for window, times in slices.items():
             key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
             yield Statistic(key, mean, function, of_units=_units(values, times))
@@ -289,22 +263,20 @@ def record_statistics(
 def _mean_of_present(
     metric: str, component: str, window: str, unit: str, values: numpy.ndarray, times: slice
 ) -> Statistic:
-    """Return the declaration of a mean over episodes and times, without NaN; a block of episodes may have only NaN."""
+    """Declare a mean over episodes and times without NaN, optional in blocks of episodes."""
     key, sums = ("record", metric, component, window, unit), sums_of_present(values[:, times])
     return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
 
 
 def _units(values: numpy.ndarray, times: slice) -> Callable[[TimeUnits], numpy.ndarray]:
-    """Return a function from units of time to sums and numbers of one episode's values ``(1, time)`` in them."""
+    """Return a function from units of time to sums and numbers of values ``(1, time)`` in them."""
     return functools.partial(TimeUnits.sums_of_present, values=values, times=times)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
-    """Yield the declarations of the statistics of NEES or NIS: mean over the dimension, share in the interval.
+    """Declare mean NEES or NIS over its dimension, and the share inside the 95 % chi-square interval.
 
-    Of a consistent filter the mean is one, and 95 % of the measurements are inside the chi-square distribution's
-    two-sided interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001,
-    5.4).
+    Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4.
     """
     component = "state" if metric == "nees" else "measurement"
     normalised, degrees = _over_dimension(run, metric)
@@ -323,21 +295,19 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
 
 
 def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return NEES or NIS over its dimension, and the dimension, ``(episodes, time)`` each; NaN for neither."""
+    """Return NEES or NIS over its dimension, and the dimension, ``(episodes, time)`` each; NaN for dimension
+    zero.
+    """
     degrees = consistency_degrees(run, metric)
     some = numpy.where(degrees > 0.0, degrees, 1.0)
     return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
 def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
-    """Return the 95 % interval of ANIS for a consistent filter: the mean of chi-square numbers over their degrees.
+    """Return the 95 % interval of ANIS (mean NIS over its dimension) for a consistent filter.
 
-    It follows from the chi-square distribution of the same variance, which is exact where all degrees are equal.
-
-    Args:
-        means: means over episodes of the count of numbers and of the sum of their inverse degrees, ``(1 + resamples,
-            2)``.
-        episodes: number of episodes.
+    By the chi-square distribution of the same variance, exact for equal degrees. ``means``
+    ``(1 + resamples, 2)`` are those of the count of measurements and of the sum of inverse degrees.
     """
     count, inverse = episodes * means[0]
     if count == 0.0:
@@ -368,9 +338,6 @@ def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
     Args:
         probability: probability of smaller numbers.
         degrees: degrees of freedom, a number or an array of any shape, larger than zero.
-
-    Returns:
-        The quantile for each number of degrees, in the same shape.
     """
     from scipy.special import gammaincinv  # scipy.stats has the quantile too, but takes a second to import
 
@@ -381,7 +348,9 @@ def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
 
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the ends of the two-sided 95 % interval of the mean over ``runs`` of chi-square numbers."""
+    """Return the ends of the 95 % interval of the mean of ``runs`` chi-square numbers, for each number of
+    degrees.
+    """
     low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
     return low, high
 
@@ -391,7 +360,7 @@ def score(
 ) -> IntervalEstimate:
     """Return ``(C_paper - C) / (C_paper - C_reference)`` with its interval; NaN if the reference is hardly better.
 
-    Each is the mean of costs or log costs in the data and every resample, ``(1 + resamples,)``.
+    Arguments are mean costs or log costs in the data and every resample, ``(1 + resamples,)``.
     """
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to their difference means nothing, and
@@ -400,7 +369,7 @@ def score(
 
 
 class Contender(NamedTuple):
-    """One competitor with its statistics, for comparisons with the others and its records."""
+    """One competitor with its statistics and costs, for its records and comparisons with others."""
 
     name: str
     kind: str
@@ -423,11 +392,10 @@ def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
-class _Against:
+class _Comparisons:
     """Comparisons of every competitor's costs with the paper's algorithm, the reference and the best competitor.
 
-    Ratios are geometric means over episodes, exp of mean differences of logarithms, in which no single episode
-    dominates.
+    Ratios are geometric means over episodes.
     """
 
     def __init__(
@@ -464,8 +432,10 @@ class _Against:
                 columns += [_wins(own / self.costs[self.paper][part]) for own in costs]
         return numpy.stack(columns, axis=1)
 
-    def behind_best(self, name: str) -> Iterator[Measure]:
-        """Yield the paired ratio of the cost to the best one's, minus one, and the share of resamples that it wins."""
+    def with_best(self, name: str) -> Iterator[Measure]:
+        """Yield the cost relative to the best competitor's, minus one, and the share of resamples that this one
+        wins.
+        """
         if name in self.ranked:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
@@ -477,8 +447,8 @@ class _Against:
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
 
-    def own(self, name: str) -> Iterator[Measure]:
-        """Yield the geometric mean of the cost, and the share of lost tracks if the environment defines them."""
+    def alone(self, name: str) -> Iterator[Measure]:
+        """Yield the geometric mean cost, and the share of lost tracks if the environment defines them."""
         if name in self.logs:
             with numpy.errstate(over="ignore"):
                 mean = self.bootstrap.interval(numpy.exp(self.logs[name]))
@@ -490,8 +460,8 @@ class _Against:
                 share = bootstrap.interval(lost) if bootstrap.ragged else of_episodes
                 yield Measure("lost_tracks", "", "all", share, "1")
 
-    def others(self, name: str) -> Iterator[Measure]:
-        """Yield the score and the paired differences to the paper's algorithm, where their inputs exist."""
+    def with_paper(self, name: str) -> Iterator[Measure]:
+        """Yield comparisons with the paper's algorithm, such as score, win rate and paired cost differences."""
         if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
@@ -515,11 +485,8 @@ class _Against:
 def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
     """Yield size and lag-one correlation of one competitor's innovations, for every group of measured quantities.
 
-    ``prediction_error`` is their root mean square in the sensor's unit. ``innovation_correlation`` is the correlation
-    of successive innovations, zero if they are white.
-
-    Args:
-        run: one competitor's part of an evaluation.
+    ``prediction_error`` is their root mean square in the sensor's unit, ``innovation_correlation`` zero for
+    white ones.
     """
     if "prediction_error" not in run:
         return
@@ -538,7 +505,7 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
 
 
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
-    """Return one for each episode with a cost ratio below one, zero above, and one half for a draw, ``(episodes,)``."""
+    """Return 1 for each episode with a cost ratio below one, 0 above, 0.5 for a draw, ``(episodes,)``."""
     # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
     draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
     return numpy.where(draw, 0.5, ratio < 1.0)
@@ -546,19 +513,16 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Return the records of every flight: cost, errors and differences to the paper's algorithm.
+    """Return a record of cost, errors and differences to the paper's algorithm for every flight.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
-
-    Args:
-        dataset: evaluation of a set of flights.
     """
     parts = parts_by_flight(dataset)
     return [r for part in parts for r in tidy_records(part) if r.metric in PER_FLIGHT]
 
 
 def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
-    """Yield the dataset of each flight's episodes, in the order of the flights' names."""
+    """Yield the part of the dataset with each flight's episodes, by the flights' names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
         part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # a copy
@@ -577,23 +541,23 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
-    ``median_anees`` (median over the episodes, which a few lost tracks do not determine), ``nees_inside`` and
-    ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (95 % interval of the mean of a consistent
-    filter); ``log_likelihood`` (mean log-density of a measurement under its prediction); ``mean_mode_probability``;
-    ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards); ``lost_episodes`` of estimators (share), and of
-    estimates from a file ``missing``, the share of measurements without a row. Where the evaluation was timed
-    ``nanoseconds``, processor time of a measurement, whose component is ``compiled`` or ``python``. Without truth the
-    metrics that need it are left out. For a recording with tracks ``prediction_error`` and ``innovation_correlation``,
-    whose intervals are over stretches of measurements.
+    ``median_anees`` (median over episodes), ``nees_inside`` and ``nis_inside`` (share inside the 95 %
+    chi-square interval), ``anis_band`` (95 % interval of the mean of a consistent filter); ``log_likelihood``
+    (mean log-density of a measurement under its prediction); ``mean_mode_probability``; ``cost`` (uncapped
+    mean), ``return`` (sum of the ``cost`` rewards); ``lost_episodes`` of estimators (share), and of estimates
+    from a file ``missing``, the share of measurements without a row. Where the evaluation was timed
+    ``nanoseconds``, processor time of a measurement, whose component is ``compiled`` or ``python``. Without
+    truth the metrics that need it are left out. For a recording with tracks ``prediction_error`` and
+    ``innovation_correlation``, whose intervals are over stretches of measurements.
 
-    ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks`` the share
-    of episodes whose mean cost is above the environment's bound. Against the paper's algorithm, paired,
-    ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one), ``cost_difference``
-    and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate`` over episodes, ``score`` =
-    (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best ranked competitor
-    ``behind_best`` (as the geometric difference; the component names the best) and ``best_share``, the share of
-    resamples of the episodes in which this one is the best (the first of those with equal costs). And the environment's
-    own metrics.
+    ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks``
+    the share of episodes whose mean cost is above the environment's bound. Against the paper's algorithm,
+    paired, ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one),
+    ``cost_difference`` and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate``
+    over episodes, ``score`` = (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against
+    the best ranked competitor ``behind_best`` (as the geometric difference; the component names the best) and
+    ``best_share``, the share of resamples of the episodes in which this one is the best. And the
+    environment's own metrics.
 
     Args:
         dataset: from an evaluation.
@@ -606,13 +570,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
 def contender_of(
     results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: OwnMetrics | None
 ) -> Contender:
-    """Return a competitor with its statistics, from the results of :func:`record_statistics`.
-
-    Args:
-        results: results over all its episodes.
-        run: the competitor's part of an evaluation, of which only coordinates and attributes are needed.
-        bootstrap: bootstrap over the episodes.
-        metrics: metrics of the environment.
+    """Return a competitor with its statistics, from the results of :func:`record_statistics` over all its
+    episodes.
     """
     measures = []
     for (kind, *words), value in results.items():
@@ -630,7 +589,7 @@ def contender_of(
         found, causes = split_by_cause(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
-        estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
+        estimate = IntervalEstimate(time.nanoseconds, time.low, time.high)
         measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
     costs, over_time = results.get(("cost",)), None
     if costs is not None and isinstance(bootstrap, BlockBootstrap):
@@ -643,7 +602,7 @@ def contender_of(
 def _compare_causes(
     contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
 ) -> Iterator[Measure]:
-    """Yield the mean cost under each cause relative to that of the opponent; the cause is stored as the window."""
+    """Yield the ratio of the mean cost to the opponent's under each cause, which is stored as the window."""
     split = {c.name: c.causes for c in contenders if c.causes is not None}
     if contender.name not in split:
         return
@@ -657,22 +616,16 @@ def _compare_causes(
 def records_of(
     contenders: Sequence[Contender], evaluation: "xarray.Dataset", bootstrap: Bootstrap
 ) -> list[Record]:
-    """Return all records of an evaluation, from its competitors' statistics and the comparisons between them.
-
-    Args:
-        contenders: all competitors, with their statistics.
-        evaluation: dataset with the attributes.
-        bootstrap: bootstrap over the episodes.
-    """
+    """Return all records of an evaluation, from its competitors' statistics and comparisons between them."""
     attrs = evaluation.attrs
-    against = _Against(contenders, attrs, bootstrap)
+    against = _Comparisons(contenders, attrs, bootstrap)
 
     def finite(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
 
     records = []
     for c in contenders:
-        compared = *against.own(c.name), *against.others(c.name), *against.behind_best(c.name)
+        compared = *against.alone(c.name), *against.with_paper(c.name), *against.with_best(c.name)
         measures = [*c.measures, *compared, *c.further]
         measures += _compare_causes(c, contenders, bootstrap)
         for m in measures:

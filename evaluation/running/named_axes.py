@@ -44,7 +44,7 @@ MEASURED = ("that of the environment's table of measurements", "as the sensors r
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
-    """Return the attributes ``units`` and ``long_name`` of a dataset variable; empty if they are not known here."""
+    """Return ``units`` and ``long_name`` of a dataset variable; empty if they are not known here."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
         return {"units": "1", "long_name": f"{cost}, normalised as stated"}
@@ -55,18 +55,7 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
-    """Return the coordinates that relate the evaluation of a recording to its log.
-
-    Args:
-        recording: the replayed recording.
-        episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
-        dataset: the evaluation.
-
-    Returns:
-        Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
-        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth of
-        some is unknown.
-    """
+    """Return dataset coordinates that relate the evaluation of a recording to its log, such as ``log_time``."""
     length = dataset.sizes["time"]
     coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
     if recording.log_time is not None:
@@ -77,7 +66,7 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Return the names of a variable's ``count + 1`` dimensions after policy, episode and time."""
+    """Return the names of a variable's dimensions after policy, episode and time, ``count + 1`` of them."""
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)
@@ -91,10 +80,8 @@ def _further_dimensions(key: str, count: int) -> list[str]:
 
 
 def action_names(model: Model) -> tuple[str, ...]:
-    """Return the names of the components of a box of actions.
-
-    They are the names in the observation block of the last action, if there is one; else the hypotheses, if there is a
-    number for each; else the control, numbered from 1 on where there are several.
+    """Return the names of a box action's entries: those of the observed last action, the hypotheses, or the
+    control.
     """
     count = math.prod(model.action_space.shape or ())
     shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
@@ -136,7 +123,9 @@ class StackedArrays:
         self._written: list[tuple[int, slice, set[str]]] = []
 
     def write(self, name: str, part: slice, new_values: dict[str, numpy.ndarray]) -> None:
-        """Write a competitor's values in some episodes, ``(episodes, time, ...)`` by name; empty the mapping."""
+        """Write a competitor's values in some episodes, ``(episodes, time, ...)`` by name, and remove them from
+        the mapping.
+        """
         place = self._places[name]
         self._written.append((place, part, set(new_values)))
         while new_values:
@@ -170,15 +159,7 @@ def with_named_axes(
     windows: Mapping[str, tuple[int, int]],
     seeds: Sequence[int],
 ) -> "xarray.Dataset":
-    """Return the dataset of the values of all competitors, with coordinates and units.
-
-    Args:
-        arrays: the values.
-        kinds: kind of every competitor.
-        models: model of every competitor.
-        windows: windows of the scenario.
-        seeds: seeds of the episodes.
-    """
+    """Make the dataset of all competitors' values, with coordinates and units."""
     import xarray
 
     model = next(iter(models.values()))

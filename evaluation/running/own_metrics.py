@@ -1,8 +1,7 @@
 """Metrics that one environment adds to those of all environments, computed block by block of episodes.
 
-They are computed in two steps, so that only a block of episodes is in memory. The first step gathers a few numbers of
-each episode, or arrays that are only averaged over the episodes. The second step computes the metrics from those of all
-episodes.
+The first step gathers a few numbers of each episode, or arrays to be averaged over episodes; the second
+computes the metrics from those of all episodes.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -32,7 +31,7 @@ class Measure(NamedTuple):
 
 
 class MetricInputs(NamedTuple):
-    """Inputs of an environment's metrics, from episodes of one competitor; empty mappings where there are none."""
+    """Inputs of an environment's metrics, gathered from episodes of one competitor."""
 
     each: Arrays = {}  # noqa: RUF012  (never written to)
     """Numbers of every episode, ``(episodes, ...)``: all are stored, so they should be few."""
@@ -44,7 +43,7 @@ class MetricInputs(NamedTuple):
 
 @dataclass(frozen=True)
 class OwnMetrics:
-    """The functions that compute an environment's own metrics."""
+    """The two functions that compute an environment's own metrics: gather inputs, then compute."""
 
     gather: "Callable[[xarray.Dataset], MetricInputs]"
     """Function from one competitor's part of some episodes of an evaluation to the inputs."""
@@ -52,10 +51,8 @@ class OwnMetrics:
     """Function from the inputs of all episodes, and the evaluation's coordinates and attributes, to the measures."""
 
     def statistics(self, run: "xarray.Dataset") -> Iterator[Statistic]:
-        """Yield the inputs of the metrics as declarations of statistics, for some episodes.
-
-        Args:
-            run: some episodes of one competitor.
+        """Gather the metrics' inputs from some episodes of one competitor; yield them as declarations of
+        statistics.
         """
         each, averaged, common = self.gather(run)
         for key, values in averaged.items():
@@ -68,13 +65,7 @@ class OwnMetrics:
     def measures_of(
         self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: "xarray.Dataset"
     ) -> list[Measure]:
-        """Return the environment's metrics of one competitor.
-
-        Args:
-            results: results of :meth:`statistics` of all episodes.
-            bootstrap: bootstrap over the episodes.
-            evaluation: the competitor's part of the evaluation, of which only coordinates and attributes are needed.
-        """
+        """Return the environment's metrics of one competitor."""
         gathered = MetricInputs(
             *({key[1]: results[key] for key in results if key[0] == f} for f in MetricInputs._fields)
         )

@@ -1,11 +1,10 @@
 """Parallel work in processes of this machine or on a cluster, with the same results as in one process.
 
-A piece of work is a function of a module and its arguments: plain data, such as names and seeds, or objects that can be
-pickled. Pieces are run in any order, each with one thread of BLAS and torch, and each seeds its own random numbers. So
-the results in the order of the pieces have the same bits wherever they were computed.
+A piece of work is a function of a module and its arguments. Each is run with one thread of BLAS and torch and
+seeds its own random numbers, so that results have the same bits wherever they were computed.
 
-On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are repeated where a
-process or a machine is lost. joblib's backend for Ray is a pool of actors, and ends with the first lost actor.
+On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are repeated
+where a process or a machine is lost.
 """
 
 import os
@@ -66,7 +65,7 @@ class Elsewhere(Exception):  # noqa: N818  (the cause of an error, not an error)
 
 
 def end_with_parent(parent: int) -> None:
-    """Start a thread that ends this process when the process with the id ``parent`` ends, even if it is killed."""
+    """Start a thread that ends this process soon after its parent process, even if that is killed."""
 
     def watch() -> None:
         if sys.platform == "win32":
@@ -83,7 +82,7 @@ def end_with_parent(parent: int) -> None:
 
 
 def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths) -> Outcome:
-    """Unpickle a function and its argument, and call it in this process, which may be new; return its outcome."""
+    """Unpickle a function and its argument, and call it with the parent's import paths; return its outcome."""
     with suppress(OSError):  # another machine may not have it
         os.chdir(paths.folder)
     if paths.safe_path is None:  # competing programs run in the user's environment
@@ -113,10 +112,8 @@ def _sendable(error: Exception) -> Exception:
 
 
 def check_workers(workers: Any) -> "Workers":
-    """Return the workers unchanged; None becomes workers that use only this process.
-
-    Raises:
-        ValueError: for any other type, such as a number.
+    """Return the workers unchanged, for None those that use only this process; raise ValueError for other
+    types.
     """
     if workers is not None and not isinstance(workers, Workers):
         raise ValueError(
@@ -163,7 +160,9 @@ class Workers:
 
     @property
     def width(self) -> int:
-        """Best number of pieces of work; for a remote cluster an assumed number."""
+        """Number of pieces into which work is best divided: processes or cores, an assumed number for a remote
+        cluster.
+        """
         if self.alone:
             return 1
         if self.cluster is not None and "://" in self.cluster:
@@ -201,9 +200,6 @@ class Workers:
             sizes: measurements of each piece, for the progress.
             progress: called with the number of measurements done; for work in other processes when a piece is done.
 
-        Yields:
-            Number of a piece and its result, in the order of completion.
-
         Raises:
             ValueError: if a process is lost for good, or the cluster does not exist; and any error of the function.
         """
@@ -239,7 +235,7 @@ class Workers:
         sizes: Sequence[int] | None = None,
         progress: Progress | None = None,
     ) -> list[Any]:
-        """Call a function with each item, on all processes; return the list of results in the order of the items."""
+        """Call a function with each item on all processes; return the results in the order of the items."""
         found: list[Any] = [None] * len(items)
         for index, result in self.run(function, items, sizes, progress):
             found[index] = result
@@ -339,7 +335,7 @@ class Workers:
     def _from_ray(
         ray: Any, remote: Any, calls: Iterator[tuple[Any, ...]], pending: list[Any]
     ) -> Iterator[Outcome]:
-        """Submit pieces of work to the cluster and yield their outcomes; fill ``pending`` with running ones."""
+        """Submit pieces of work to a Ray cluster and yield their outcomes; ``pending`` holds those submitted."""
         more = True
         while pending or more:
             # The cluster may grow meanwhile; two pieces for each core keep it busy.
@@ -371,7 +367,6 @@ class Workers:
 
 @contextmanager
 def _environment(**variables: str) -> Iterator[None]:
-    """Set environment variables inside the context, also for the processes that start in it."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

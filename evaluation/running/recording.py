@@ -27,11 +27,11 @@ class NoFilter(Filter[Task, Any, Initial]):
     """Filter whose estimate is always the initial one, for runs without an estimator."""
 
     def start(self, initial: Any) -> Initial:
-        """Return the initial estimate as the state."""
+        """Return the initial estimate, as the state."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, inputs: FilterInput) -> Initial:
-        """Return the state unchanged."""
+        """Return the state, the initial estimate, unchanged."""
         return state
 
 
@@ -40,13 +40,12 @@ def _no_filter(model: Model) -> NoFilter:
 
 
 def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
-    """Return a recording of the measurements and the truth in the simulated episodes of an experiment.
+    """Simulate the episodes of an experiment; return their measurements and truth as a recording.
 
-    They are the episodes of an evaluation of the experiment. Replayed on the same backend, observations, estimates and
-    costs are the same, bit for bit.
+    Replayed on the same backend, observations, estimates and costs are those of an evaluation, bit for bit.
 
     Args:
-        experiment: only its fields for the episodes, the parameters and the backend are used, since no policy runs.
+        experiment: episodes, parameters and backend are used; no policy runs.
         progress: called with the number of measurements done, now and then.
 
     Raises:
@@ -109,7 +108,9 @@ def _check_size(task: Task, episodes: int) -> None:
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Return measurements and truth by name, ``(E, T, ...)``, and the initial values given to filters, ``(E, ...)``."""
+    """Simulate episodes; return measurements and truth by name, ``(E, T, ...)``, and initial values
+    ``(E, ...)``.
+    """
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
     count, interval = len(seeds), model.task.decision_interval
@@ -148,5 +149,4 @@ def _measured(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
-    """Return an array ``(..., N)`` as ``(episodes, ...)``, without the padding lanes."""
     return numpy.moveaxis(values[..., :count], -1, 0).copy()

@@ -19,7 +19,7 @@ from ...envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
-from ..competitors.filters import close_loop
+from ..competitors.filters import TRUTH_FREE_KINDS, close_loop
 from ..competitors.kinds import (
     Kind,
     check_competitor,
@@ -33,6 +33,7 @@ from ..competitors.smoothers import SmoothedTrack, check_open_loop, report_smoot
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
 from .stored_values import DRAWN_PREFIX
+from .times import ProcessorTime, net_time
 
 AT_ONCE = 2**18
 """Measurements, over all episodes side by side, in one call of native code."""
@@ -92,7 +93,7 @@ def rollout(
 def _step(
     looped: Model, maker: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank with a policy, or a filter without one if ``maker`` is None."""
+    """Yield report and action at every measurement, of a policy's bank, or of a filter if ``maker`` is None."""
     lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
     if maker is None:
         action = numpy.zeros(len(seeds), dtype=numpy.int64)
@@ -245,13 +246,13 @@ def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[st
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> EpisodeReports:
-    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call."""
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call; return their reports."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     interval = looped.task.decision_interval
     decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
 
     def run(decisions: int, whole: bool) -> EpisodeReports:
-        """Run a number of decisions; for whole episodes return a view."""
+        """Return the reports on a number of decisions; on whole episodes as views."""
         reports, actions = lanes.run(report, compiled_policy, decisions * interval)
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
@@ -296,7 +297,7 @@ def _join_stretches(
 def _step_episodes(
     steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
 ) -> EpisodeReports:
-    """Run episodes step by step and collect the reports."""
+    """Run episodes step by step and return the reports."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
@@ -333,11 +334,7 @@ def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
 
 
 def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.ndarray:
-    """Return actions ``(time, ..., N)``, episodes first.
-
-    Raises:
-        ValueError: for the first action outside the action space, apart from the limits of a box.
-    """
+    """Return actions, episodes first; raise ValueError if one is outside the action space (but for a box's limits)."""
     space, kept = model.action_space, _episodes_first(actions, count)
     if isinstance(space, gymnasium.spaces.Discrete):
         kept = kept.astype(numpy.int64)
@@ -351,25 +348,14 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
 
 TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
 """Episodes side by side, and measurements of each, in a measurement of time: enough for two digits."""
+COMPILED_EPISODES = 64
+"""Episodes side by side of native code: the states of large filters stay in the core's own cache."""
 RUN_SECONDS = 0.01
 """Approximate duration of a run, s, where the episodes are long enough."""
 TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.02, 3, 20
 """Duration, s, and numbers of repeated runs, of which the quickest counts."""
-TIMED_ROUNDS = 3
-"""Measurements of a competitor and of the world in turn, of which the quickest of each count."""
-LEAST_NANOSECONDS = 1.0
-"""Least time of a competitor, ns: a difference of two measured times is no more precise."""
-
-
-class ProcessorTime(NamedTuple):
-    """Processor time of a competitor for one measurement on one core, without the simulated world."""
-
-    nanoseconds: float
-    """Time of a measurement of one of many episodes side by side, ns."""
-    compiled: bool
-    """Whether all code is native; otherwise the time is mostly that of the steps in Python."""
-    own: bool = False
-    """Whether it is the time of a program's own process, which includes the exchange of messages."""
+TIMED_ROUNDS, MOST_ROUNDS = 3, 10
+"""Numbers of measurements of a competitor and of the world in turn: more while their times differ much."""
 
 
 def measure_time(
@@ -377,9 +363,9 @@ def measure_time(
 ) -> ProcessorTime | None:
     """Measure the processor time that a competitor takes for a measurement.
 
-    :data:`TIMED_EPISODES` episodes run side by side, after tracing and compilation. For native code the quickest of
-    several runs counts, since disturbances only add time; for Python code the median decision. The time of the
-    simulated world (:func:`measure_world`) is subtracted. A program's time is that of its own process.
+    Many episodes run side by side, after tracing and compilation. For native code the quickest of several runs counts,
+    for Python code the median decision. The time of the simulated world (:func:`measure_world`) is
+    subtracted (:func:`.times.net_time`). A program's time is that of its own process.
 
     Args:
         model: task with a bank; for a policy, that of its control.
@@ -389,8 +375,7 @@ def measure_time(
         name: name of the competitor in errors.
 
     Returns:
-        Time of at least :data:`LEAST_NANOSECONDS`. None for smoothers, bounds and competitors made for given episodes,
-        and where a program's time is not known.
+        None for smoothers, bounds and competitors made for given episodes, and where a program's time is not known.
     """
     if kind in ("smoother", "bound") or is_made_for_episodes(competitor):
         return None
@@ -398,36 +383,45 @@ def measure_time(
     spent = run()
     if spent is None or spent.own:
         return spent
-    world = measure_world(model, seeds)
+    together, alone = [spent.nanoseconds], [measure_world(model, kind, seeds)]
+    found = net_time(together, alone, spent.compiled)
     # In turn, since the speed of a processor that others use changes.
-    for _ in range(TIMED_ROUNDS - 1 if spent.compiled else 0):
-        spent, world = min(spent, run() or spent), min(world, measure_world(model, seeds))
-    return spent._replace(nanoseconds=max(spent.nanoseconds - world, LEAST_NANOSECONDS))
+    while spent.compiled and (
+        len(alone) < TIMED_ROUNDS or (len(alone) < MOST_ROUNDS and not found.is_certain)
+    ):
+        together.append((run() or spent).nanoseconds)
+        alone.append(measure_world(model, kind, seeds))
+        found = net_time(together, alone, True)
+    return found
 
 
 class IdleEstimator:
-    """Estimator that repeats the initial estimate: a run takes the time of the simulated world."""
+    """Estimator or reference that repeats the initial estimate: a run takes the time of the simulated world."""
 
     traceable = True
+    disturbances = None
 
-    def start(self, initial: Any, lanes: int) -> tuple[Array, Array]:
+    def start(self, initial: Any, _: Any) -> tuple[Array, Array]:
         """Return the initial mean and covariance."""
         return initial.mean, initial.covariance
 
-    def update(
-        self, memory: tuple[Array, Array], measurement: Any
-    ) -> tuple[Array, Array, tuple[Array, Array]]:
+    def update(self, memory: tuple[Array, Array], *_: Any) -> tuple[Array, Array, tuple[Array, Array]]:
         """Return the initial mean and covariance again."""
         return *memory, memory
 
 
-def measure_world(model: Model, seeds: Sequence[int]) -> float:
-    """Return the processor time of the simulated world for a measurement, ns: motion and sensors."""
+def measure_world(model: Model, kind: Kind, seeds: Sequence[int]) -> float:
+    """Return the processor time of the simulated world for a measurement, ns: motion and sensors.
+
+    For estimators it includes the check of every estimate; estimates of policies and references are not checked.
+    """
+    idle_kind: Kind = "estimator" if kind in TRUTH_FREE_KINDS else "reference"
 
     def prepare() -> Callable[[], ProcessorTime | None]:
-        return _timed_run(model, IdleEstimator, "estimator", seeds, "idle")
+        return _timed_run(model, IdleEstimator, idle_kind, seeds, "idle")
 
-    run = model.programs.keep(measure_world, prepare) if isinstance(model, CompiledModel) else prepare()
+    key = measure_world, idle_kind
+    run = model.programs.keep(key, prepare) if isinstance(model, CompiledModel) else prepare()
     spent = run()
     return spent.nanoseconds if spent is not None else 0.0
 
@@ -446,8 +440,8 @@ def _timed_run(
     looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     compiled_policy = _compiled_policy_of(model, competitor, name) if is_policy else None
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
-        timed = _compiled_decision(looped, compiled_policy, seeds, decisions)
-        return lambda: ProcessorTime(1e9 * timed() / (len(seeds) * task.decision_interval), True)
+        timed = _compiled_decision(looped, compiled_policy, seeds[:COMPILED_EPISODES], decisions)
+        return lambda: ProcessorTime(1e9 * timed() / (COMPILED_EPISODES * task.decision_interval), True)
     steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
 
     def run_in_python() -> ProcessorTime | None:
@@ -490,10 +484,12 @@ def _compiled_decision(
         return lambda: setting_up
 
     def measure() -> float:
+        first: list[float] = []
         spent: list[float] = []
         while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+            first.append(run(1))  # in turn: an error of the first decision must not enter every measurement
             spent.append(run(count))
-        return (min(spent) - setting_up) / (count - 1)
+        return (min(spent) - min(first)) / (count - 1)
 
     return measure
 

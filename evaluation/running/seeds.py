@@ -9,9 +9,7 @@ SPLITS = {"train": 0, "validation": 1, "test": 2}
 
 
 def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[int]:
-    """Return a list of the seeds of an experiment's episodes.
-
-    Each is an ordinary Gymnasium seed: ``env.reset(seed=...)`` replays the episode.
+    """Return the seeds of an experiment's episodes; ``env.reset(seed=...)`` replays each.
 
     Args:
         split: "train", "validation" or "test".

@@ -13,16 +13,8 @@ DRAWN_PREFIX = "drawn_"
 
 
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Return ``nees``, the normalised estimation error squared of components with known truth, as a dictionary.
-
-    Args:
-        model: task with a filter.
-        error: estimate minus truth, ``(C, N)``; NaN where the truth or the estimate is unknown.
-        covariance: reported covariance, ``(C, C, N)``.
-
-    Returns:
-        ``nees``, ``(N,)``. With partly unknown truth it is NaN where all is unknown, and ``nees_degrees`` gives the
-        number of known components.
+    """Return ``nees`` of the components with known truth, ``(N,)``, in a dictionary, and their number if it
+    varies.
     """
     if model.task.has_whole_truth and model.filter.stated is None:
         return {"nees": log_density(error, covariance)[1]}
@@ -49,7 +41,9 @@ class StoredValues:
     """Whether to include the data for pictures of tracks, under names that begin with :data:`DRAWN_PREFIX`."""
 
     def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
-        """Return the values at the present measurement by name, ``(..., N)``; errors and costs only with truth."""
+        """Return the values to store at a measurement by name, ``(..., N)``; errors and costs only with
+        truth.
+        """
         found = {}
         if model.task.has_truth:
             error = model.error(episode)
@@ -68,5 +62,5 @@ class StoredValues:
 
 
 def bound_values(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the values to store at a measurement of a bound, by name."""
+    """Return the values to store at a measurement of a bound by name, ``(..., N)``."""
     return model.filter.records(episode.filter, episode.measurement)

@@ -1,7 +1,6 @@
 """Summaries of evaluations: the statistics of records and curves, small enough to send and to store.
 
-A summary contains one competitor. Its episodes are run in chunks, each reduced before the next begins, and the results
-are added in their order; so its bits depend only on the request.
+A summary contains one competitor, whose episodes are run and reduced in chunks.
 """
 
 import functools
@@ -90,13 +89,13 @@ class EvaluationRequest(NamedTuple):
         return (self.end - self.first) * self.horizon
 
     def work(self) -> Work | None:
-        """Return the identity of the summary in a store; None if it is not stored."""
+        """Return name and identity of the request's summary in a store; None if it is not stored."""
         if self.identity is None:
             return None
         return Work(f"{file_stem(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Return a list of requests for fewer episodes each, which together cover this one."""
+        """Divide a request into requests for fewer episodes each."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
@@ -104,13 +103,13 @@ class EvaluationRequest(NamedTuple):
 
 
 def file_stem(experiment: Experiment) -> str:
-    """Return the first part of the name of files about an experiment, with environment, scenario and seed."""
+    """Return the beginning of file names for an experiment: environment, scenario, episodes, split and seed."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
 
 class Evaluation(NamedTuple):
-    """Results of an evaluation."""
+    """Results of an evaluation: dataset, records, curves and costs."""
 
     dataset: xarray.Dataset
     """Values of every episode (:func:`.evaluate.run_experiment`); for summaries only coordinates, attributes and
@@ -155,11 +154,11 @@ class Part(NamedTuple):
     head: xarray.Dataset
 
     def merge(self, later: "Part") -> "Part":
-        """Return the sums and samples of these and the next episodes together."""
+        """Return these sums and samples with those of the next episodes added."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
     def summary(self, request: EvaluationRequest) -> Summary:
-        """Return the summary of the competitor, from the sums and samples of all its episodes."""
+        """Compute the competitor's summary from the sums and samples of all its episodes."""
         results, bootstrap = self.reduction.results(), cached_bootstrap(request.episodes)
         contender = contender_of(results, self.head, bootstrap, request.metrics)
         curves = competitor_curves(results) if request.curves else None
@@ -167,11 +166,7 @@ class Part(NamedTuple):
 
 
 def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run a request; return its summary, or if it has only some of the episodes, their sums and samples.
-
-    Raises:
-        ValueError: as :func:`reduce_episodes`.
-    """
+    """Run a request; return its summary, or sums and samples if it contains only some of the episodes."""
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield from record_statistics(run, request.episodes, request.metrics)
@@ -187,12 +182,7 @@ def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
 def reduce_episodes(
     request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run a request block by block of episodes; return sums and samples for declared statistics.
-
-    Args:
-        request: request of one competitor over episodes.
-        declare: function from some of its episodes to their statistics.
-        tick: called with the number of measurements done.
+    """Run a request block by block of episodes; return the sums and samples of declared statistics.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
@@ -204,7 +194,6 @@ def reduce_episodes(
     block = block_of(plan.models[request.name].task.horizon)
 
     def part(first: int) -> Part:
-        """Run a block of episodes and reduce it; its measurements are freed at the end of the call."""
         piece = plan.piece(request.name, first, min(block, request.end - first), True)
         count = len(piece.seeds)
         kept = plan.arrays(count, request.experiment.drawn_episodes - first)
@@ -228,16 +217,14 @@ def summaries(
     progress: Progress | None = None,
     store: Store | None = None,
 ) -> Iterator[tuple[int, Summary]]:
-    """Run requests for competitors, of any environments; yield number and summary of each when it is finished.
+    """Evaluate requests for competitors, or read stored summaries; yield number and summary of each when
+    available.
 
     Args:
         requests: the requests, started in this order.
         workers: processes that do the work.
         progress: called with the number of measurements done.
-        store: stores each summary, so that a second call reads it. Default: nothing is stored.
-
-    Yields:
-        Number of a competitor among them and its summary, as they are finished.
+        store: stores each summary, so that a second call reads it.
 
     Raises:
         ValueError: if a competitor cannot be sent to another process, or a file not be written; and as
@@ -285,7 +272,9 @@ def summaries(
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Return lists of requests that share a model, with at most ``BATCH`` measurements; a process traces it once."""
+    """Group requests that share a model into batches of at most ``BATCH`` measurements; a process traces it
+    once.
+    """
     batches: list[list[tuple[int, EvaluationRequest]]] = []
     last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
     for i, piece in pieces:
@@ -301,7 +290,7 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 @one_thread()
 def combine_summaries(parts: Sequence[Summary]) -> Evaluation:
-    """Return the evaluation (records, curves, costs) of all competitors, from their summaries."""
+    """Combine the summaries of all competitors into one evaluation."""
     evaluation = _heads_together(
         [one.head for one in parts], [one.contender.losses for one in parts], parts[0].episodes
     )
@@ -318,7 +307,7 @@ def combine_summaries(parts: Sequence[Summary]) -> Evaluation:
 def _actions_by_control(
     curves: Sequence[CompetitorCurves], controls: Sequence[str]
 ) -> list[CompetitorCurves]:
-    """Return the curves with the control added to the names of actions, if competitors use several controls."""
+    """Add the control to the names of actions, if competitors use several controls."""
     if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
         return list(curves)
     return [
@@ -328,7 +317,9 @@ def _actions_by_control(
 
 
 class SeparateResults(NamedTuple):
-    """Reduced results of one competitor over flights, a recording or one episode; all are resampled together."""
+    """Reduced results of one competitor over flights, a recording or one episode, which are resampled
+    together.
+    """
 
     reduced: Reduced
     flights: list[Reduced]
@@ -344,7 +335,7 @@ class SeparateResults(NamedTuple):
 
 
 def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
-    """Return the results of one competitor, from its part of an evaluation over flights, a recording or one episode."""
+    """Reduce one competitor's evaluation over flights, a recording or one episode to sums, costs and curves."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
@@ -381,7 +372,9 @@ def _combine_alone(
     evaluation: xarray.Dataset,
     metrics: OwnMetrics | None,
 ) -> Evaluation:
-    """Return the evaluation of all competitors over flights, a recording or one episode."""
+    """Combine the reduced results of all competitors over flights, a recording or one episode into one
+    evaluation.
+    """
     reduced = [one.reduced for one in found.values()]
     bootstrap = bootstrap_of_reduced(reduced, evaluation)
     if isinstance(bootstrap, BlockBootstrap):
@@ -416,13 +409,10 @@ def run_requests(
 
     Args:
         requests: one request for each competitor.
-        workers: processes that share the work.
+        workers: processes for the work.
         progress: called with the number of measurements done.
-        store: stores each summary, so that a second call reads it. Default: nothing is stored.
+        store: stores each summary, so that a second call reads it.
         whole: whether to store every number of every episode.
-
-    Raises:
-        ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
     first, names = requests[0], [one.name for one in requests]
     if whole:

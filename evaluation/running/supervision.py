@@ -1,9 +1,8 @@
 """Supervision of a command in a child process, so that a competitor that crashes loses only its own row.
 
-A user's class runs in the process that simulates the world: its processor time is measured as that of all others,
-without messages between processes. It can end that process, or never return. So the command forks (on Linux): the child
-does all of the work and reports which competitor's code it runs, and its parent waits. Where the child ends in the code
-of a user's competitor, or that code takes too long, another child starts again without that competitor.
+A user's class runs in the process that simulates the world, and can end that process or never return. So the
+command forks (on Linux): the child does the work and reports which competitor's code it runs. Where it ends
+in a user's code, or that code takes too long, another child starts again without that competitor.
 """
 
 import os
@@ -38,7 +37,7 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
         seconds: time limit of a competitor from one measurement to the next.
 
     Returns:
-        Reasons why some competitors take no part, by name: in the child, or in this process where none is left.
+        Reasons for excluded competitors by name; in the child, or in this process where none is left.
 
     Raises:
         SystemExit: in the parent, when its child has done the work, with the child's status.
@@ -74,12 +73,8 @@ def is_supervised() -> bool:
 
 @contextmanager
 def report_running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
-    """Report to the parent process that a competitor's code runs inside the context; yield its progress function.
-
-    Args:
-        name: name of the competitor.
-        progress: a progress function to call as well.
-        timed: whether the competitor is ended if the progress is not called in time.
+    """Report to the parent process that a competitor's code runs inside the context; yield a progress
+    function.
     """
     tick = progress or (lambda measurements: None)
     if name not in _supervised:
@@ -107,10 +102,8 @@ def _report(line: str) -> None:
 
 
 def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
-    """Wait for the end of a child, or kill it where a competitor is late; return that competitor and the reason.
-
-    Raises:
-        SystemExit: if it ended elsewhere, with its status.
+    """Wait for a child and exit with its status; if a competitor is late, kill it and return its name and
+    why.
     """
     running, unread, heard, status, limit = "", b"", time.monotonic(), 0, seconds
     # Ctrl-C and a termination request are for the child.

@@ -1,7 +1,6 @@
 """Restriction of numerical libraries to one thread.
 
-Products of many small matrices are slower on several threads than on one, most of all where other work needs the cores;
-and the division of a product between threads may change its last bit.
+Products of many small matrices are slower on several threads, and their division may change the last bit.
 """
 
 import functools
@@ -21,13 +20,7 @@ _INSIDE = ContextVar("inside", default=False)
 
 @functools.lru_cache(1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the controller of the loaded libraries that have threads; cached until more modules are imported.
-
-    A search takes 1.5 ms.
-
-    Args:
-        modules: number of imported modules.
-    """
+    """Return the controller of libraries' threads, cached by the number of modules: a search takes 1.5 ms."""
     return ThreadpoolController()
 
 

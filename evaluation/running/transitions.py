@@ -1,4 +1,4 @@
-"""Transitions in episodes of a policy, as Gymnasium returns them: observations, actions and rewards."""
+"""Observations, actions and rewards in episodes of a policy, as Gymnasium returns them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -32,18 +32,16 @@ def transitions_of(
     tick: Progress = lambda decisions: None,
     **keywords: Any,
 ) -> list[Transitions]:
-    """Return the transitions of a policy in one episode for each seed.
+    """Run a policy in one episode for each seed; return its observations, actions and rewards.
 
-    The episodes run in parallel in the native vector environment.
-
-    Actions are clipped to the action space and cast to its type before they are applied, as a learning agent must: they
-    may differ from those of an evaluation by rounding.
+    Actions are clipped to the action space and cast to its type, so that they may differ from those of an
+    evaluation by rounding.
 
     Args:
         id: environment id.
         policy: policy made for the environment; its ``keywords`` make the environment.
         seeds: seeds of the episodes.
-        tick: called with the number of decisions done.
+        tick: function called with the number of decisions done.
         **keywords: further keywords of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
 
     Returns:
@@ -72,7 +70,7 @@ def transitions_of(
 
 
 def clip_to_space(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
-    """Return a batch of actions, clipped to the limits of the action space and cast to its type."""
+    """Clip a batch of actions to the limits of the action space and cast it to its type."""
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.clip(action, space.low, space.high)
     return numpy.asarray(action).astype(space.dtype)

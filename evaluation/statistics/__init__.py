@@ -1,5 +1,4 @@
 """Statistics over episodes: reduction by blocks of episodes, bootstrap intervals, innovations, causes.
 
-It imports ``storage``. Begin with :mod:`.statistic`, which declares statistics; :mod:`.bootstrap` computes their
-intervals.
+Begin with :mod:`.statistic`, which declares statistics; :mod:`.bootstrap` computes their intervals.
 """

@@ -2,12 +2,10 @@
 
 A bootstrap sample of M episodes is a vector of multinomial counts, and the mean of anything over the sample
 is a product with it. So one matrix of counts serves every statistic, and those computed from one sample are
-paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resamples by index for each statistic,
-which is a hundred times slower here.
+paired. ``scipy.stats.bootstrap`` gives the same intervals, a hundred times slower.
 
-Of many episodes that matrix would be the largest thing in memory, so only the counts are stored, in as few bytes as
-possible, and products are summed over fixed blocks of episodes. For more than ``SEPARATE`` episodes, groups of
-successive ones are resampled: independent episodes make independent groups, whose mean varies as that of the episodes.
+For more than ``SEPARATE`` episodes, groups of successive ones are resampled: independent episodes make
+independent groups, whose mean varies as that of the episodes.
 
 Episodes of one recorded flight are no independent samples of all flights. Where episodes belong to flights, whole
 flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997, 3.8): the
@@ -44,26 +42,23 @@ class IntervalEstimate(NamedTuple):
 
 
 def ratio(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the first entry of the second axis over the second, ``(n, 2, ...)`` to ``(n, ...)``; NaN over zero."""
+    """Divide the first entry of the second axis by the second, ``(n, 2, ...)`` to ``(n, ...)``; NaN over
+    zero.
+    """
     first, second = sums[:, 0], sums[:, 1]
     return numpy.divide(first, second, out=numpy.full(first.shape, numpy.nan), where=second > 0.0)
 
 
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the means ``(1 + resamples, ...)`` from the sums :meth:`Bootstrap.sums` of all episodes; NaN for none."""
+    """Return means ``(1 + resamples, ...)`` from the sums of :meth:`Bootstrap.sums` over all episodes; NaN for
+    none.
+    """
     return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Return the value and its 95 % percentile interval, from the values of all bootstrap resamples.
-
-    The ends are NaN where a resample is not finite, or without resamples.
-
-    Args:
-        samples: value of the data and of every resample, ``(1 + resamples, ...)``.
-
-    Returns:
-        ``(3, ...)``: value, lower and upper end.
+    """Return value and 95 % interval from ``samples``: the value in the data and every resample,
+    ``(1 + resamples, ...)``.
     """
     if len(samples) == 1:
         return numpy.concatenate([samples, numpy.full((2, *samples.shape[1:]), numpy.nan)])
@@ -76,8 +71,6 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
 
 def share_interval(share: float, number: int) -> IntervalEstimate:
     """Return a share of independent episodes with its 95 % Wilson score interval.
-
-    The interval has a width also for the shares 0 and 1.
 
     Wilson's score interval (E. B. Wilson, Probable inference, the law of succession, and statistical inference, Journal
     of the American Statistical Association 22, 1927): all shares p with ``|share - p| <= z sqrt(p (1 - p) / n)``.
@@ -95,25 +88,19 @@ def share_interval(share: float, number: int) -> IntervalEstimate:
 
 
 def block_of(times: int) -> int:
-    """Return the number of episodes to run and reduce in one block, given their number of measurements.
-
-    It is large enough to be fast and small enough for the memory.
-
-    Args:
-        times: number of measurements of an episode.
-    """
+    """Return the number of episodes to run and reduce in one block, for episodes of ``times`` measurements."""
     return min(BLOCK, max(FEWEST, MEASUREMENTS // times))
 
 
 class Bootstrap:
-    """Bootstrap resamples of M episodes, the same for every statistic.
+    """Bootstrap resamples of M episodes, the same for every statistic, so that differences are paired.
 
     Args:
-        episodes: number of episodes M.
+        episodes: number M.
         resamples: number of bootstrap samples.
         seed: seed of the resampling; fixed, so that a table can be reproduced.
-        clusters: cluster of each episode, ``(episodes,)``; whole clusters are resampled then, unless there is only one.
-            Values may then be NaN after the end of an episode, and means leave NaN out.
+        clusters: cluster of each episode, ``(episodes,)``; whole clusters are resampled then, unless there is
+            only one. Values may then be NaN after the end of an episode, and means leave NaN out.
     """
 
     def __init__(
@@ -143,11 +130,13 @@ class Bootstrap:
         self._last: tuple[slice, numpy.ndarray] | None = None
 
     def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of the cluster or group of each of these episodes."""
+        """Return the index of the resampled unit (episode, cluster or group) of each of these episodes."""
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Return sums ``(1 + resamples, ...)`` of integers ``(clusters, ...)``, with the counts of each resample."""
+        """Return sums of integers ``(clusters, ...)`` weighted by the counts of each resample,
+        ``(1 + resamples, ...)``.
+        """
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
@@ -168,7 +157,7 @@ class Bootstrap:
     def sums(
         self, values: Sequence[numpy.ndarray], first: int = 0, resamples: int | None = None
     ) -> list[numpy.ndarray]:
-        """Return the weighted sums over some episodes in the data and every resample, for several arrays at once.
+        """Return weighted sums over some episodes in the data and every resample, for several arrays at once.
 
         Args:
             values: arrays ``(some, ...)`` of the same episodes, at most ``BLOCK``.
@@ -176,8 +165,8 @@ class Bootstrap:
             resamples: number of first resamples, equal to those of a bootstrap with fewer; None: all.
 
         Returns:
-            Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes the sums of the values without
-            NaN and of their weights, ``(1 + resamples, 2, ...)``.
+            Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes of the values
+            without NaN and of their weights, ``(1 + resamples, 2, ...)``.
         """
         some = len(values[0])
         flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
@@ -200,18 +189,11 @@ class Bootstrap:
         ]
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return the means over the episodes of the data and of every resample.
-
-        Args:
-            values: ``(episodes, ...)``.
-
-        Returns:
-            ``(1 + resamples, ...)``; the first row is the data's own.
-        """
+        """Return the means over the episodes in the data and in every resample, ``(1 + resamples, ...)``."""
         return self.means_of(lambda part: values[part])
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Return the means over the data and every resample, of values that a function gives for episode slices."""
+        """Return means as :meth:`means`, of values that a function returns for slices of episodes."""
         parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
@@ -219,9 +201,6 @@ class Bootstrap:
         self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
         """Return a quantile over the episodes of the data and of every resample, ``(1 + resamples,)``.
-
-        A quantile is the smallest value that at least that share of the weight does not exceed; NaN without chosen
-        episodes.
 
         Args:
             values: one for each episode, ``(episodes,)``.
@@ -254,13 +233,15 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Return the percentile interval of a statistic in the data and its resamples, ``(1 + resamples,)``."""
+        """Return a statistic with its percentile interval, from its values in data and resamples,
+        ``(1 + resamples,)``.
+        """
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Return the paired relative difference of two competitors' :meth:`means`, with its interval."""
+        """Return ``means / others - 1`` of two competitors with its paired interval."""
         return self.interval(means / others - 1.0)
 
     def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:

@@ -1,8 +1,8 @@
 """Cost and consistency of a competitor split by cause, such as turns, the start or outliers.
 
-Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and ``other``, which holds
-where no other cause does. Several may hold together, so shares need not add up to one. Comparisons are paired: the
-means of both competitors come from the same resamples of the episodes.
+Causes are those that the environment declares (:mod:`.contract.causes`), the start of the track, and ``other``
+for all other measurements. Several may hold together, so shares need not add up to one. Comparisons are
+paired.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ EVERYTHING, START, OTHER = RESERVED
 CAUSE_METRICS = "cause_"
 """Prefix of the names of metrics by cause."""
 VARIABLE = "causes"
-"""Name of the dataset variable with the active causes as a bit field, see :func:`.envs.causes.cause_number`."""
+"""Name of the dataset variable with the active causes as a bit field, see :func:`.contract.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)
 """Columns of the sums over the measurements under a cause: their number, cost, NEES over its dimension, number with a
 NEES.
@@ -54,7 +54,7 @@ class CauseCosts(NamedTuple):
 
 
 def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return a mapping from each cause of an evaluation to a phrase for tables; empty without causes."""
+    """Return a phrase for tables for each cause of an evaluation, by name; empty without causes."""
     if "cause" not in dataset.coords:
         return {}
     declared = zip(dataset["cause"].values.tolist(), dataset["cause_phrase"].values.tolist(), strict=True)
@@ -63,13 +63,7 @@ def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
-    """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``.
-
-    The first is ``EVERYTHING``.
-
-    Args:
-        run: one competitor's part of an evaluation with causes.
-    """
+    """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``."""
     numbers = numpy.nan_to_num(run[VARIABLE].values).astype(numpy.int64)
     yield EVERYTHING, numpy.ones(numbers.shape, dtype=bool)
     early = run["time"].values <= int(run["start_measurements"])
@@ -83,12 +77,12 @@ def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 def cause_sums(
     run: "xarray.Dataset", nees: numpy.ndarray | None, units: TimeUnits | None = None
 ) -> numpy.ndarray:
-    """Return number, cost and NEES of the measurements under each cause, summed over every episode.
+    """Sum costs and NEES, and count them, under each cause over every episode or unit of time.
 
     Args:
         run: one competitor's part of some episodes.
         nees: NEES over its dimension, ``(episodes, time)``, NaN where there is none; None without NEES.
-        units: units of time of one episode, in place of episodes; None: episodes.
+        units: units of time of one episode, in place of episodes.
 
     Returns:
         ``(episodes, causes, 4)``, in the order of :func:`active_causes`.
@@ -108,7 +102,7 @@ def cause_sums(
 def split_by_cause(
     sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
 ) -> tuple[list[CauseMeasure], CauseCosts]:
-    """Return the shares of cost, mean costs and ANEES of a competitor under each cause that occurs.
+    """Compute statistics such as share of the cost, mean cost and ANEES under each cause that occurs.
 
     Args:
         sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.
@@ -138,17 +132,9 @@ def split_by_cause(
 
 
 def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
-    """Return weights that order causes by importance: share of the cost times log of the relative mean cost.
+    """Return weights that order causes: share of the cost times log of the relative mean cost.
 
-    The relative mean cost is that under the cause over that of all measurements. A large
-    cost in few measurements has the largest weight, a cause that nearly always holds a small one.
-
-    Args:
-        cost_share: share of the whole cost, of any shape.
-        measurement_share: share of all measurements, of the same shape.
-
-    Returns:
-        Weights of that shape; zero where there is no cost.
+    A large cost in few measurements has the largest weight.
     """
     some = (cost_share > 0.0) & (measurement_share > 0.0)
     dearer = numpy.divide(cost_share, measurement_share, out=numpy.ones_like(cost_share), where=some)
@@ -156,14 +142,8 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
-    """Return the name of the competitor to compare with: the ranked one with the lowest cost among the others.
-
-    Empty without another competitor.
-
-    Args:
-        name: name of the competitor.
-        costs: mean costs by name.
-        ranked: names of the ranked competitors; the opponent is an unranked one where there is no other ranked one.
+    """Return the competitor of lowest cost among the others, a ranked one if there is any; empty without
+    others.
     """
     others = [other for other in costs if other != name]
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")

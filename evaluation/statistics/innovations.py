@@ -1,8 +1,7 @@
 """Innovations of recorded measurements for every estimator: measurement minus prediction, in the sensor's units.
 
-The prediction follows from the estimate after the previous measurement, by the log format of the environment. A filter
-with the right model has white innovations: successive ones are not correlated. Intervals are those of
-:mod:`.predictions`, which exist for a single recording, too.
+The prediction follows from the estimate after the previous measurement, by the log format of the environment.
+A filter with the right model has white (uncorrelated) innovations.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
-    """Return the evaluation of a recording with the innovations added as the variable ``prediction_error``.
+    """Add the innovations of every competitor to the evaluation of a recording, as ``prediction_error``.
 
     Its dimensions are policy, episode, time and measured.
 
@@ -52,12 +51,7 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
 
 
 def measured_quantities(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
-    """Return the measured quantities that a log format can predict, ``(m, episodes, time)``; None without predictions.
-
-    Args:
-        run: one competitor's part of an evaluation with tracks.
-        task: task of the recording.
-    """
+    """Return the quantities that a log format can predict, ``(m, episodes, time)``, or None."""
     log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in run:
         return None

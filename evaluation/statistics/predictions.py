@@ -22,12 +22,7 @@ UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
-    """Return the lag-one correlation of innovations with its 95 % interval; zero if they are white.
-
-    Args:
-        errors: innovations, ``(m, episodes, time)``.
-        mask: true for the measurements to use, ``(episodes, time)``.
-    """
+    """Return the lag-one correlation of innovations with its 95 % interval; zero if they are white."""
     before = numpy.roll(errors, 1, axis=2)
     before[:, :, 0] = math.nan
     values = numpy.stack([(errors * before).sum(axis=0), 0.5 * (errors**2 + before**2).sum(axis=0)], axis=-1)
@@ -37,7 +32,7 @@ def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
 def stretch_interval(
     mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Return a function of two means over measurements, with a 95 % interval from resampled stretches of them.
+    """Return a function of two means over measurements, with a 95 % interval by resampled stretches.
 
     Args:
         mask: true for the measurements to use, ``(episodes, time)``.
@@ -54,7 +49,9 @@ def stretch_interval(
 
 
 def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
-    """Return the number of the stretch to which each measurement belongs, ``(episodes, time)``; -1 outside the mask."""
+    """Divide the measurements of a mask into stretches; return each one's number, ``(episodes, time)``, or
+    -1.
+    """
     total = int(mask.sum())
     stretch = numpy.full(mask.shape, -1, dtype=numpy.int16)
     stretch[mask] = numpy.arange(total) // max(SHORTEST_STRETCH, -(-total // STRETCHES))
@@ -64,7 +61,7 @@ def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
 def interval_of_sums(
     sums: numpy.ndarray, counts: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Return a function of two means, with a 95 % interval, from the sums over each stretch of measurements.
+    """Return a function of two means with a 95 % interval, from sums over stretches of measurements.
 
     Args:
         sums: sums over each stretch, ``(stretches, 2)``.
@@ -96,11 +93,7 @@ class LikelihoodSums(NamedTuple):
 
 
 def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
-    """Return the sums of one competitor's log-likelihoods over stretches; None if it reports none.
-
-    Args:
-        run: the competitor's part of an evaluation.
-    """
+    """Sum one competitor's log-likelihoods over stretches of measurements; None if it reports none."""
     if "log_likelihood" not in run:
         return None
     values = run["log_likelihood"].values

@@ -1,9 +1,7 @@
 """Statistics over the episodes of one competitor, declared one by one and computed block by block of episodes.
 
-Records, curves and the metrics of an environment are computed from means over episodes, one for every bootstrap
-resample, and from samples: values of every episode, as quantiles require. A :class:`Statistic` declares the
-contribution of an episode and the function of all contributions; :func:`reduce_run` reduces some episodes to a
-:class:`Reduction`, with one matrix product for all means of a block, and reductions are merged in the order of the
+A :class:`Statistic` declares the contribution of an episode and the function of all contributions;
+:func:`reduce_run` reduces some episodes to a :class:`Reduction`; reductions are merged in the order of the
 episodes.
 """
 
@@ -36,7 +34,9 @@ def identity(values: numpy.ndarray) -> numpy.ndarray:
 
 
 class Statistic(NamedTuple):
-    """Declaration of a statistic: the contributions of some episodes and the function of their mean or sample."""
+    """Declaration of a statistic: a contribution of each episode, and a function of their means or of a
+    sample.
+    """
 
     key: Key
     values: numpy.ndarray
@@ -56,7 +56,7 @@ class Statistic(NamedTuple):
 
 
 class Reduction(NamedTuple):
-    """Sums and samples over some episodes of one competitor for its statistics, which can be merged."""
+    """Sums and samples of one competitor's statistics over some episodes, which can be merged."""
 
     functions: dict[Key, Function]
     sums: dict[Key, numpy.ndarray]
@@ -70,7 +70,7 @@ class Reduction(NamedTuple):
     """Values of the statistics of one episode that cannot be resampled over time."""
 
     def merge(self, later: "Reduction") -> "Reduction":
-        """Return the sums and samples of these and the next episodes together."""
+        """Return these sums and samples with those of the next episodes added."""
         optional = self.optional | later.optional
         sums = {key: own for key, own in (self.sums | later.sums).items() if key in optional}
         sums |= {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
@@ -78,11 +78,7 @@ class Reduction(NamedTuple):
         return Reduction(self.functions | later.functions, sums, samples, optional, {}, {})
 
     def results(self, blocks: BlockBootstrap | None = None) -> dict[Key, Any]:
-        """Return a mapping from the key of each statistic to its value; call it once, since it empties the samples.
-
-        Args:
-            blocks: for one episode, the bootstrap over its units.
-        """
+        """Return the value of each statistic by key; call it once, since it empties the samples."""
         found = {}
         for key, function in self.functions.items():
             if key in self.known:
@@ -104,14 +100,7 @@ def reduce_run(
     bootstrap: Bootstrap | TimeUnits,
     first: int = 0,
 ) -> Reduction:
-    """Return the sums and samples over some episodes of one competitor for the declared statistics.
-
-    Args:
-        run: one competitor's part of an evaluation.
-        declare: function from a block of its episodes to their statistics.
-        bootstrap: bootstrap over the episodes of the whole evaluation; for one episode its units of time.
-        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
-    """
+    """Reduce some episodes of one competitor to the sums and samples of declared statistics."""
     block = block_of(run.sizes["time"])
     parts = (
         _reduce_block(declare(run.isel(episode=slice(i, i + block))), bootstrap, first + i)

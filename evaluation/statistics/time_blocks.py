@@ -1,18 +1,15 @@
 """Bootstrap intervals for one episode, from resampled blocks of successive measurements.
 
-A circular block bootstrap (Politis and Romano: A circular block-resampling procedure for stationary data, in LePage and
-Billard, Exploring the Limits of Bootstrap, 1992): a resample consists of blocks with random beginnings, which wrap
-around at the end, with the total length of the episode. The length of the blocks follows from the autocorrelation
-(Politis and White: Automatic block-length selection for the dependent bootstrap, Econometric Reviews 23, 2004, with the
-correction of Patton, Politis and White, Econometric Reviews 28, 2009). It assumes that the averaged series is
-stationary. In long episodes blocks begin at units of a few measurements, and only the sums of units are stored.
+A circular block bootstrap (Politis and Romano: A circular block-resampling procedure for stationary data, in
+LePage and Billard, Exploring the Limits of Bootstrap, 1992): a resample consists of blocks with random
+beginnings, which wrap around at the end, with the total length of the episode. The length of the blocks
+follows from the autocorrelation (Politis and White: Automatic block-length selection for the dependent
+bootstrap, Econometric Reviews 23, 2004, with the correction of Patton, Politis and White, Econometric Reviews
+28, 2009). It assumes that the averaged series is stationary. Blocks begin at units of a few measurements.
 
-An episode of few blocks has no interval: the estimated autocorrelation of a short series is too small, and so is the
-interval. For first-order autoregressive processes the 95 % interval covers 90 to 97 % where most series have
-``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third. Where few series of a process
-pass, these are the ones whose correlation is estimated too small, and their intervals cover about half. Rules for the
-estimate of a correlation time lie on either side: 50 correlation times (emcee) and 1,000 (Sokal: Monte Carlo methods in
-statistical mechanics, in Functional Integration, 1997, 3).
+An episode of few blocks has no interval: the estimated autocorrelation of a short series is too small, and so
+is the interval. For first-order autoregressive processes the 95 % interval covers 90 to 97 % where most
+series have ``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third.
 """
 
 import math
@@ -31,9 +28,6 @@ FEWEST, FEWEST_BLOCKS = 16, 50
 class TimeUnits:
     """Division of an episode into units of successive measurements.
 
-    Args:
-        times: number of measurements of the episode.
-
     Attributes:
         unit: number of measurements of a unit.
         units: number of units of the episode; the last one may be shorter.
@@ -44,17 +38,12 @@ class TimeUnits:
         self.units: int = -(-times // self.unit)
 
     def cut(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return values ``(n, time)`` divided into units, ``(n, units, unit)``; zeros after the end."""
+        """Divide values ``(n, time)`` into units, ``(n, units, unit)``, with zeros after the end."""
         beyond = self.units * self.unit - values.shape[1]
         return numpy.pad(values, [(0, 0), (0, beyond)]).reshape(len(values), self.units, self.unit)
 
     def sums_of_present(self, values: numpy.ndarray, times: slice = slice(None)) -> numpy.ndarray:
-        """Return the sum of the values in every unit and their number, ``(units, 2)``, without NaN.
-
-        Args:
-            values: ``(1, time)``; NaN stands for no measurement, or no event.
-            times: measurements to use.
-        """
+        """Return the sum of the values in every unit and their number, without NaN, ``(units, 2)``."""
         within = numpy.zeros(values.shape, dtype=bool)
         within[:, times] = True
         within &= ~numpy.isnan(values)
@@ -94,31 +83,26 @@ class BlockBootstrap(Bootstrap):
         self.totals = self._counts.sum(axis=1)
 
     def resample(self, values: numpy.ndarray, of_units: numpy.ndarray) -> numpy.ndarray:
-        """Return the mean over the episode and over every resample of blocks, ``(1 + resamples, ...)``.
-
-        Args:
-            values: values of the episode, ``(1, ...)``.
-            of_units: contribution of each unit, see :attr:`.statistic.Statistic.of_units`.
-        """
+        """Return the mean over the episode and over every resample of blocks, ``(1 + resamples, ...)``."""
         (means,) = self.sums([of_units])
         found = means[:, 0] if values.ndim > 1 else ratio(means[:, 0])
         found[0] = values[0]
         return found
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Return the episode's own values in the first row and NaN for every resample."""
+        """Return the episode's own values, and NaN for every resample, ``(1 + resamples, ...)``."""
         own = values(slice(0, 1))
         return numpy.concatenate([own, numpy.full((len(self._counts) - 1, *own.shape[1:]), math.nan)])
 
     def quantiles(
         self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Return the episode's own value in the first row and NaN for every resample."""
+        """Return the episode's own value, and NaN for every resample, ``(1 + resamples,)``."""
         return self.means(values if mask is None else numpy.where(mask, values, math.nan))
 
     @property
     def sentence(self) -> str:
-        """Sentence that describes the intervals, or the reason why there are none."""
+        """Sentence for reports: how the intervals are computed, or why there are none."""
         blocks = f"blocks of {self.block:,} measurements, by the rule of Politis and White (2004)"
         rule = f"{blocks} from the autocorrelation"
         if self.blocks < FEWEST_BLOCKS:

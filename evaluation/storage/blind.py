@@ -17,11 +17,11 @@ MEASUREMENTS, START, NETCDF = "measurements.csv", "start.csv", "measurements.nc"
 def write_blind(folder: Path, recording: Recording, task: Task) -> None:
     """Write the measurements and initial estimates of a recording to CSV and NetCDF files, without its truth.
 
-    ``measurements.csv`` has a row for each measurement: ``track``, ``measurement`` from 1 on, ``seconds`` since the
-    start of the track, and the numbers of every field, ``position_1``, ``position_2`` and so on; missing measurements
-    are empty. ``start.csv`` has a row for each track: ``mean_X`` and ``covariance_X_Y`` of the components, and the
-    other values given to every filter. ``measurements.nc`` contains both. Numbers have all digits. No file contains the
-    seed.
+    ``measurements.csv`` has a row for each measurement: ``track``, ``measurement`` from 1 on, ``seconds``
+    since the start of the track, and the numbers of every field, ``position_1``, ``position_2`` ...; empty
+    where missing. ``start.csv`` has a row for each track: ``mean_X`` and ``covariance_X_Y`` of the
+    components, and the other values given to every filter. ``measurements.nc`` contains both. No file
+    contains the seed.
 
     Args:
         folder: folder for the files.

@@ -16,14 +16,14 @@ LIBRARIES = ("numpy", "scipy", "xarray", "llvmlite", "torch", "stable-baselines3
 
 
 def package_folders() -> list[Path]:
-    """Return the paths of the package's source folders; for an editable installation those of the working copy."""
+    """Return the package's source folders."""
     package = __name__.partition(".")[0]
     specs = [find_spec(package + room) for room in ROOMS]
     return [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
 
 
 def files_digest(folders: Iterable[Path]) -> str:
-    """Return a hexadecimal SHA-256 digest of the names and contents of the code and data files in some folders."""
+    """Return the SHA-256 digest of the names and contents of the code and data files in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES):
@@ -34,7 +34,7 @@ def files_digest(folders: Iterable[Path]) -> str:
 
 
 def library_versions(libraries: Iterable[str]) -> dict[str, str]:
-    """Return a mapping from each installed library among ``libraries`` to its version."""
+    """Return the versions of the installed libraries among some, by name."""
     versions = {}
     for library in libraries:
         try:
@@ -46,7 +46,9 @@ def library_versions(libraries: Iterable[str]) -> dict[str, str]:
 
 @functools.cache
 def code_digest() -> str:
-    """Return a cached SHA-256 digest of the package's files and the versions of Python and numerical libraries."""
+    """Return the cached SHA-256 digest of the package's files and the versions of Python and numerical
+    libraries.
+    """
     installed = library_versions(LIBRARIES)
     versions = [python_version(), *(installed.get(library, "") for library in LIBRARIES)]
     return hashlib.sha256(f"{versions} {files_digest(package_folders())}".encode()).hexdigest()

@@ -1,8 +1,7 @@
 """Coordinates and attributes of an evaluation's dataset, in a form that every file format can store.
 
-Attributes of NetCDF cannot be dictionaries, lists or booleans, and its classic format, which SciPy writes and R and
-MATLAB open, has neither unsigned nor 64-bit integers. So windows and groups are coordinates, and other values are text:
-the functions of this module read them.
+NetCDF's attributes cannot be dictionaries, lists or booleans, and its classic format has neither unsigned nor
+64-bit integers. So windows and groups are coordinates, and other values are text.
 """
 
 import json
@@ -62,10 +61,8 @@ class Losses(NamedTuple):
 
 
 def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
-    """Return the measurement of each episode's loss and the number of its reason, ``(episodes, 2)``; zeros for none.
-
-    Args:
-        run: one policy's part of an evaluation.
+    """Return each episode's loss, ``(episodes, 2)``: its measurement and the number of its reason; zeros
+    without.
     """
     faults = numpy.nan_to_num(run["lost"].values) if "lost" in run else numpy.zeros((run.sizes["episode"], 1))
     first = (faults > 0.0).argmax(axis=1)
@@ -74,11 +71,7 @@ def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
 
 
 def count_losses(losses: numpy.ndarray) -> Losses | None:
-    """Return the number of lost episodes, with the first loss; None if no episode is lost.
-
-    Args:
-        losses: measurement and reason of each episode's loss, ``(episodes, 2)``, from :func:`losses_in`.
-    """
+    """Count the lost episodes in the array of :func:`losses_in`, with the first loss; None if none is lost."""
     lost = losses[:, 1] > 0.0
     if not lost.any():
         return None
@@ -87,13 +80,7 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
 
 
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
-    """Write the dataset of an evaluation to a NetCDF file, in the classic format with 64-bit offsets.
-
-    R, MATLAB and most other programs open it.
-
-    Raises:
-        ValueError: if a variable is too large for it, or the file cannot be written.
-    """
+    """Write an evaluation's dataset to a classic NetCDF file, if it is not too large."""
     if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(
             f"a variable is larger than {MOST_BYTES:,} bytes, the limit of NetCDF's classic format"
@@ -103,34 +90,30 @@ def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
 
 
 def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
-    """Return a mapping from the name of each window to its first and last measurement, both included, from 1 on.
-
-    Args:
-        dataset: evaluation, in memory or read from a file.
-    """
+    """Return each window's first and last measurement, both included, from 1 on, by its name."""
     ends = (dataset[name].values.tolist() for name in ("window", "window_first", "window_last"))
     return {name: (int(first), int(last)) for name, first, last in zip(*ends, strict=True)}
 
 
 def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
-    """Return a mapping from the name of each window to its slice of the time axis."""
+    """Return each window's slice of the time axis, by its name."""
     return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
 
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
-    """Return the dataset with its windows replaced by these."""
+    """Return a dataset with these windows in place of its own."""
     dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
     return dataset.assign_coords(window_coords(windows))
 
 
 def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return the dataset coordinates that store the windows: their names, first and last measurements."""
+    """Return the dataset coordinates that store windows: names, first and last measurements."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
     return {"window": list(windows), "window_first": ("window", first), "window_last": ("window", last)}
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
-    """Return a mapping from each group of components, such as ``position``, to the names of its components."""
+    """Return the names of each group's components, such as those of ``position``, by the group's name."""
     found: dict[str, list[str]] = {}
     for name, group in zip(
         dataset["component"].values.tolist(), dataset["group"].values.tolist(), strict=True
@@ -141,16 +124,16 @@ def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
 
 
 def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
-    """Return the task parameters of the evaluation by name, read from its attribute; sequences are lists.
+    """Read the task parameters of an evaluation from its attribute, by name; sequences are lists.
 
-    Other objects, of a user's task, are text, as Python's ``repr`` gives them.
+    Other objects are text, their ``repr``.
     """
     found: dict[str, Any] = json.loads(dataset.attrs["keywords"])
     return found
 
 
 def keywords_as_text(keywords: Mapping[str, Any]) -> str:
-    """Return parameters as the text of a JSON object; values that JSON cannot store become their ``repr``."""
+    """Write parameters as a JSON object; values that JSON cannot store become their ``repr``."""
     return json.dumps(keywords, default=_plain)
 
 
@@ -161,17 +144,17 @@ def _plain(value: Any) -> Any:
 
 
 def whole_number(value: int) -> int | str:
-    """Return an integer for a NetCDF attribute: as text if it is too large for the classic format."""
+    """Return an integer for a NetCDF attribute, as text if it is too large for the classic format."""
     return value if abs(value) <= MOST_WHOLE else str(value)
 
 
 def seed_of(dataset: "xarray.Dataset") -> int:
-    """Return the seed of the experiment, from the dataset's attributes."""
+    """Return the seed of the experiment."""
     return int(dataset.attrs["seed"])
 
 
 def notes_of(dataset: "xarray.Dataset") -> list[str]:
-    """Return the dataset's notes on the scenario and a sentence for each competitor with lost episodes."""
+    """Return notes on the scenario, and a sentence for each competitor with lost episodes."""
     notes = str(dataset.attrs["notes"]).splitlines()
     for name in dataset["policy"].values.tolist() if "lost" in dataset else ():
         if (losses := count_losses(losses_in(dataset.sel(policy=name)))) is not None:

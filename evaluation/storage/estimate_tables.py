@@ -1,5 +1,4 @@
-"""Estimates of another program, read from a file: CSV, NetCDF, or trajectories in the format of the TUM RGB-D
-benchmark.
+"""Estimates of another program, read from CSV, NetCDF or a trajectory file (TUM RGB-D).
 
 A row is an estimate: its track, its time in seconds, the mean of each component, and optionally its covariance. The
 columns are those that ``filtergym evaluate --estimates`` and the programs of ``filtergym export`` write:
@@ -8,8 +7,8 @@ columns are those that ``filtergym evaluate --estimates`` and the programs of ``
     seconds (or time, t), log_time     time of the log, or s since the start of the track; see below
     estimate_X (or mean_X, X)          mean of the component X, in its unit
     sigma_X                            its standard deviation; or
-    covariance_X_Y                     of two components, in either order; zero where a pair is left out log_likelihood,
-    nis, nis_degrees   statistics of the predicted measurement
+    covariance_X_Y                     of two components, in either order; zero where a pair is left out
+    log_likelihood, nis, nis_degrees   statistics of the predicted measurement
 
 Times are read as in a log: seconds, a smaller unit since 1970, dates, or times of day.
 """
@@ -63,7 +62,7 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
         components: names of the estimated components.
 
     Raises:
-        ValueError: if it cannot be read, contains no estimates, or those of several competitors.
+        ValueError: if it cannot be read, has no estimates, or those of several competitors.
     """
     try:
         if path.suffix not in SUFFIXES:
@@ -79,7 +78,7 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
-    """Return the columns of a CSV or Parquet table by name, as numbers, or as text for tracks and times."""
+    """Read a CSV or Parquet table; return its columns by name, numbers, or text for tracks and times."""
     pairs = [f"covariance_{a}_{b}" for a in components for b in components]
     forms = [form + name for name in components for form in ("estimate_", "mean_", "sigma_", "")]
     columns, names, _ = read_table(path, {*TRACK, *SECONDS, LOG_TIME, "policy", *LIKELIHOOD, *forms, *pairs})
@@ -93,7 +92,7 @@ def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
 
 
 def _netcdf_columns(path: Path) -> dict[str, Any]:
-    """Return the columns of a flat table by name, from the variables of a NetCDF file.
+    """Read a NetCDF file of estimates as a flat table; return its columns by name.
 
     The variables are over episode, time and component, and optionally over one policy.
     """
@@ -176,7 +175,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
 
 
 def _track_name(value: Any) -> str:
-    """Return the name of a track as text, without the fraction of a whole number: "3" for 3.0."""
+    """Return the name of a track as text, "3" for 3.0."""
     text = str(value).strip()
     return text.removesuffix(".0") if text.removesuffix(".0").isdigit() else text
 
@@ -184,7 +183,7 @@ def _track_name(value: Any) -> str:
 def _covariance(
     columns: Mapping[str, Any], components: Sequence[str], rows: int
 ) -> tuple[tuple[bool, ...], numpy.ndarray]:
-    """Return which components have a variance, and the covariances ``(C, C, R)`` from the columns of a table.
+    """Return which components have a variance, and covariances ``(C, C, R)``, from the columns of a table.
 
     NaN for components without a variance, zero for pairs without a covariance.
     """
@@ -204,10 +203,7 @@ def _covariance(
 
 
 def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Return the table of positions from one TUM file, or from a folder with a file for each track.
-
-    The orientation is not read.
-    """
+    """Read the positions of one TUM file, or of a folder with one for each track, as a table of estimates."""
     import pandas
 
     axes = [components.index(name) for name in AXES if name in components]
@@ -236,7 +232,7 @@ def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _trajectory(file: Path) -> numpy.ndarray:
-    """Return the time and position of every line of a TUM file, ``(rows, 4)``, s and m."""
+    """Read time and position of every line of a TUM file, ``(rows, 4)``, s and m."""
     found = []
     for number, line in enumerate(read_content(file).decode("utf-8").splitlines()):
         words = line.split()

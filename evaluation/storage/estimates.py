@@ -23,10 +23,10 @@ def check_estimates(path: Path) -> None:
 
 
 def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset of the estimates of an evaluation with tracks, for export.
+    """Return the dataset of all competitors' estimates for export, from an evaluation with tracks.
 
-    Its variables are ``estimate`` and ``sigma`` over policy, recording, time and component, ``seconds``, and where the
-    evaluation has them ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
+    Its variables are ``estimate`` and ``sigma`` over policy, episode, time and component, ``seconds``, and
+    where known ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
 
     ``seconds`` count from the start of the track; for a recording from the first measurement of the log, and
     ``log_time`` is the time in the log, so that rows can be joined with those of the log.
@@ -55,9 +55,6 @@ def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
     Args:
         path: path that ends in ``.csv`` or ``.nc``; or a folder that ends in ``.tum``, see :func:`write_trajectories`.
         dataset: evaluation with ``tracks=True``.
-
-    Raises:
-        ValueError: if it cannot be written.
     """
     check_estimates(path)
     if path.suffix == ".tum":
@@ -89,7 +86,7 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
 
 
 def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
-    """Write estimated and true positions as trajectory files in the TUM RGB-D format, which ``evo`` reads.
+    """Write estimated and true positions as trajectory files in the TUM RGB-D format.
 
     A file has the lines ``time x y z qx qy qz qw``, s and m; the orientation is the identity, and a z that is not
     estimated is zero. The time is that of the log, of dates since 1970; without a log it counts from the start of the

@@ -1,7 +1,6 @@
 """Atomic writing of files and folders: they are written under another name, then renamed.
 
-An error of the operating system, such as a full disk, becomes one sentence with the path. Locks, which end with their
-process, exclude two writers of the same file.
+Errors of the operating system become one sentence with the path. Locks exclude two writers of the same file.
 """
 
 import os
@@ -37,10 +36,8 @@ def _explain_refusals(place: str) -> Iterator[None]:
 
 
 def writable_folder(path: Path) -> Path:
-    """Return the path unchanged if files can be written to this folder; a missing folder is not created.
-
-    Raises:
-        ValueError: if no file can be written there.
+    """Return a folder's path unchanged, or raise ValueError if files cannot be written there; it is not
+    created.
     """
     with _explain_refusals(f"to folder {path}"):
         there = next(place for place in (path, *path.absolute().parents) if place.exists())
@@ -64,7 +61,7 @@ def _make_folder(path: Path) -> Iterator[None]:
 
 
 def _lock(handle: int) -> bool:
-    """Try to lock an open file or folder until it is closed; return False if another process has locked it."""
+    """Lock an open file or folder until it is closed; return False if another process has locked it."""
     try:
         if fcntl is None:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
@@ -82,11 +79,7 @@ _CLAIMED: dict[str, int] = {}
 
 
 def claim_folder(folder: Path) -> None:
-    """Lock a folder until this process ends, so that no other process writes a run or a benchmark there.
-
-    Raises:
-        ValueError: if another process has claimed it, or it cannot be made.
-    """
+    """Lock a folder until this process ends; raise ValueError if another process writes there."""
     name = os.path.realpath(folder)
     if name in _CLAIMED:
         return
@@ -102,13 +95,7 @@ def claim_folder(folder: Path) -> None:
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Lock a folder inside the context, so that no other process writes there.
-
-    Folders that were created for it are removed if they are empty afterwards.
-
-    Raises:
-        ValueError: as of :func:`claim_folder`.
-    """
+    """Lock a folder inside the context; remove folders made for it if they are empty afterwards."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     claim_folder(folder)
     name = os.path.realpath(folder)
@@ -124,7 +111,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 
 def _sweep_unfinished(folder: Path) -> None:
-    """Remove the temporary folders in a folder whose writing processes have ended."""
+    """Remove temporary folders whose writing processes have ended."""
     for place in folder.glob(f"{UNFINISHED}*"):
         with suppress(OSError):
             if not (place / LOCK).exists():
@@ -143,10 +130,8 @@ def _sweep_unfinished(folder: Path) -> None:
 
 
 def writable_file(path: Path) -> Path:
-    """Return the path unchanged if a file can be written there; its folder is not created.
-
-    Raises:
-        ValueError: if it cannot, or if a folder or a device has its name.
+    """Return a path unchanged, or raise ValueError if no file can be written there; its folder is not
+    created.
     """
     with _explain_refusals(f"file {path}"):
         if path.exists() and not path.is_file():
@@ -165,9 +150,10 @@ def _partial(path: Path) -> Path:
 
 @contextmanager
 def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
-    """Yield the path of a temporary file that replaces the file at ``path`` when the context ends without error.
+    """Yield the path of a temporary file, which replaces the file at ``path`` if the context ends without
+    error.
 
-    A lock excludes other writers meanwhile, so the old contents read inside the context are those that are replaced.
+    A lock excludes other writers.
 
     Args:
         path: path of the file.
@@ -189,7 +175,6 @@ def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
 
 @contextmanager
 def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
-    """Create and lock the temporary file of :func:`whole_file` inside the context."""
     held = partial if UNIX else partial.with_name(partial.name + LOCK)
     handle = _open_locked(held, partial.name[1:-8], time.monotonic() + patience)
     try:
@@ -203,13 +188,7 @@ def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
 
 
 def _open_locked(partial: Path, name: str, until: float) -> int:
-    """Open and lock a file, with attempts until a time of the monotonic clock; return its handle.
-
-    Args:
-        partial: the file.
-        name: name of the written file, for the error.
-        until: end of the attempts, s.
-    """
+    """Open and lock a file, with attempts until a time of the monotonic clock, s; return its handle."""
     while True:
         handle = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -240,13 +219,7 @@ def _hold(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder; its files are moved into ``folder`` when the context ends without error.
-
-    Files in its subfolders go into the same subfolders of ``folder``.
-
-    Raises:
-        ValueError: if they cannot be written.
-    """
+    """Yield a temporary folder, whose files are moved into ``folder`` if the context ends without error."""
     writable_folder(folder)
     with (
         _explain_refusals(f"to folder {folder}"),
@@ -270,9 +243,8 @@ def _beside(folder: Path) -> tuple[Path, Path]:
 
 
 def find_folder(folder: Path) -> Path:
-    """Return the path that has a folder's contents: itself, or a neighbour after a crash of :func:`whole_folder`.
-
-    The old one is moved away only when the new one is complete, so without the folder both others are whole.
+    """Return the path with a folder's contents: itself, or a neighbour if :func:`whole_folder` was
+    interrupted.
     """
     partial, old = _beside(folder)
     if folder.exists() or not old.exists():
@@ -281,11 +253,7 @@ def find_folder(folder: Path) -> Path:
 
 
 def settle_folder(folder: Path) -> None:
-    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies.
-
-    Raises:
-        ValueError: if it cannot be moved into its place.
-    """
+    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies."""
     found = find_folder(folder)
     if found != folder:
         with _explain_refusals(f"folder {folder}"):
@@ -296,11 +264,7 @@ def settle_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield the path of a temporary folder that replaces ``folder`` when the context ends without error.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Yield the path of a temporary folder, which replaces ``folder`` if the context ends without error."""
     settle_folder(folder)
     partial, old = _beside(folder)
     with _explain_refusals(f"folder {folder}"), _make_folder(folder.parent):
@@ -317,10 +281,6 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text to a file, in UTF-8, atomically.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Write a text to a file, in UTF-8, atomically."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")

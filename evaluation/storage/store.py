@@ -1,7 +1,7 @@
 """Store of results on disk, so that after an interruption the same command computes only the missing ones.
 
-The result of each piece of work is one file. Its name ends with a digest of everything that determines the result: the
-request and the code. A changed request or code has another name, and is computed again.
+Each result is one file, whose name ends with a digest of request and code; after a change of either it is
+computed again.
 
 A file is MessagePack of a declared type. Reading it executes and imports nothing, and returns that type or None.
 """
@@ -41,14 +41,7 @@ class Work(NamedTuple):
 
 
 class Store:
-    """Results of pieces of work, stored in a folder as one file each.
-
-    Args:
-        folder: folder, made with the first result; None: nothing is stored.
-
-    Raises:
-        ValueError: if the folder cannot be written to.
-    """
+    """Store of results in a folder, one file each; with a folder of None nothing is stored."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder: Path | None = None if folder is None else writable_folder(folder)
@@ -63,12 +56,7 @@ class Store:
         return self.folder / f"{name}.{digest[:DIGITS]}{SUFFIX}"
 
     def read(self, work: Work | None, kind: type[Result]) -> Result | None:
-        """Return the stored result of a unit of work; None if it is not stored.
-
-        Args:
-            work: the piece; None for one that is never stored, since changes of its code cannot be recognised.
-            kind: type of its result.
-        """
+        """Read the stored result of a unit of work; None if it is not stored."""
         path = self._path(work)
         if path is None or not path.is_file():
             return None
@@ -78,10 +66,9 @@ class Store:
             return None  # of another program, or damaged: it is computed again
 
     def write(self, work: Work | None, result: Any) -> None:
-        """Write the result of a piece of work to its file: numbers, strings, arrays or datasets in typed containers.
+        """Store the result of a unit of work: numbers, strings, arrays or datasets in typed containers.
 
-        A result that cannot be written, for example on a full disk, is computed again after an interruption, with a
-        warning.
+        Warn if it cannot be written.
         """
         path = self._path(work)
         if path is not None:
@@ -93,7 +80,7 @@ class Store:
                 warnings.warn(f"{error}: after an interruption it is computed again", stacklevel=2)
 
     def result(self, work: Work | None, kind: type[Result], make: Callable[[], Result]) -> Result:
-        """Return the stored result of a piece of work, or compute it with ``make`` and store it."""
+        """Return the stored result of a unit of work, or compute it with ``make`` and store it."""
         found = self.read(work, kind)
         if found is None:
             found = make()
@@ -101,7 +88,9 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Remove the files of all work that this store has read or written, and the folder if it is empty."""
+        """Remove the files of all work that this store has read or written, and the folder if it is then
+        empty.
+        """
         if self.folder is None or not self.folder.is_dir():
             return
         own = rf"\.?(.+)\.[0-9a-f]{{{DIGITS}}}{re.escape(SUFFIX)}(\.partial)?"  # a crash leaves partial ones
@@ -114,7 +103,7 @@ class Store:
 
 
 def _encode(value: Any) -> Any:
-    """Return a NumPy or xarray value as one that MessagePack can store."""
+    """Convert a NumPy or xarray value for MessagePack."""
     if isinstance(value, numpy.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, numpy.generic):

@@ -11,11 +11,11 @@ Stored = TypeVar("Stored")
 
 
 def read_json(path: Path) -> Any:
-    """Return the contents of a JSON file, as Python values.
+    """Read a JSON file, with checks of its size and nesting; return Python values.
 
     Raises:
         FileNotFoundError: if the file does not exist.
-        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.foreign_files`.
+        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.data.foreign_files`.
     """
     try:
         return foreign_files.read_json(path)
@@ -26,10 +26,8 @@ def read_json(path: Path) -> Any:
 
 
 def restore(cls: type[Stored], values: Any) -> Stored:
-    """Make a dataclass or named tuple from a dictionary of its fields, with a check of their types.
-
-    Raises:
-        ValueError: if a field is missing, unknown, or not of its declared type.
+    """Make a dataclass or named tuple from a dictionary of its fields; raise ValueError for wrong fields or
+    types.
     """
     if not isinstance(values, dict):
         raise ValueError(f"expected the fields of a {cls.__name__}, got {quote_shortened(values)}")

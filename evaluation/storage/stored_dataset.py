@@ -16,7 +16,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
     """Return a dataset of numbers and strings as a dictionary of JSON values; NaN becomes null.
 
     Args:
-        dataset: values that are no numbers become strings.
+        dataset: dataset of numbers and strings.
         digits: significant digits of variables, by their names.
         otherwise: significant digits of the other variables.
     """
@@ -42,11 +42,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
 
 
 def dataset_from_json(stored: Any) -> xarray.Dataset:
-    """Return the dataset stored in the JSON values of :func:`dataset_as_json`.
-
-    Raises:
-        ValueError: if it is no dataset: its parts do not fit together, or contain other types than numbers and strings.
-    """
+    """Return the dataset stored in the JSON values of :func:`dataset_as_json`; raise ValueError for others."""
     if not isinstance(stored, dict) or not all(isinstance(stored.get(part), dict) for part in PARTS):
         raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
 
@@ -80,11 +76,7 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
 
 
 def _array(values: Any, kind: Any) -> numpy.ndarray:
-    """Return a list of numbers as an array; None becomes NaN.
-
-    Raises:
-        ValueError: if one is too large.
-    """
+    """Return a list of numbers as an array, with NaN for None; raise ValueError if one is too large."""
     try:
         return numpy.array(values, dtype=kind)
     except OverflowError as error:

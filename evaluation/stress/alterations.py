@@ -1,8 +1,7 @@
 """Alterations of measurements between the sensors and a filter, such as gaps, outliers and wrong clocks.
 
-Each is a pure function of a :class:`.streams.Stream` and a generator of random numbers. It returns another stream, or
-None where it does not apply: the environment's measurements have no time, or no flag for received measurements. The
-world declares the meaning of fields (:class:`~filtergym.envs.contract.world.World`).
+Each is a pure function of a :class:`.streams.Stream` and a generator of random numbers. It returns another
+stream, or None where it does not apply.
 """
 
 from collections.abc import Callable
@@ -28,7 +27,7 @@ Function = Callable[[Stream, numpy.random.Generator], Stream | None]
 
 
 class Alteration(NamedTuple):
-    """Name, description and function of one alteration of measurements."""
+    """One alteration of measurements: name, description and function."""
 
     name: str
     description: str
@@ -38,7 +37,7 @@ class Alteration(NamedTuple):
 
 
 def _cut(stream: Stream, begin: int, end: int | None) -> Stream:
-    """Return a stream cut some measurements after the end of a temporary or the beginning of a lasting alteration."""
+    """Cut a stream some measurements after the end of a temporary or the beginning of a lasting alteration."""
     length = LASTING if end is None else end + AFTERWARDS
     return replace(stream.select(numpy.arange(min(length, len(stream)))), begin=begin, end=end)
 
@@ -49,7 +48,7 @@ def _unaltered(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 def _gap(scans: int) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Remove measurements from a timed stream; in others set them to not received."""
+        """Remove measurements of a timed stream, else mark them as not received; None without such a mark."""
         if stream.is_timed:
             seconds = stream.seconds
             kept = numpy.r_[:SETTLED, SETTLED + scans : len(stream)]
@@ -132,7 +131,9 @@ def _outlier(sigmas: float) -> Function:
 
 def _wrong_noise(factor: float) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Scale the noise covariance that the measurements state; if they state none, enlarge the errors."""
+        """Scale the noise covariance that measurements state, or else their errors; None where neither can
+        be.
+        """
         field = type(stream.task.world).stated_field
         if field:
             stated = getattr(stream.measurements, field).copy()
@@ -161,7 +162,7 @@ def _frozen(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 
 def _not_a_number(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-    """Set one measurement to NaN; None if measurements cannot be missing, since the input then rejects NaN."""
+    """Set one measurement to NaN; None for an environment whose measurements cannot be missing."""
     if not type(stream.task.world).received_field:
         return None
     readings = stream.readings.copy()
@@ -178,7 +179,7 @@ def _initial_covariance(factor: float) -> Function:
 
 
 def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
-    """Return a stream that starts in the middle: from the truth there, with errors of the initial covariance."""
+    """Start in the middle of a stream, from the truth there with errors of the initial covariance."""
     before, initial = stream.at(SETTLED - 1), stream.initial
     root = semidefinite_root(initial.covariance)
     errors = numpy.einsum("ijn,jn->in", root, generator.standard_normal(initial.mean.shape))

@@ -1,12 +1,10 @@
 """Stress test of a filter: it runs under every alteration of its measurements, with a verdict for each.
 
-The test checks at every measurement that mean and covariance are finite, and the covariance symmetric and positive
-definite. It compares the error with that of the same filter on unaltered measurements of the same episodes, and checks
-that the error recovers after a temporary alteration, that the covariance agrees with the errors (ANEES), and the time
-of updates.
+It checks that estimates are valid at every measurement, compares the error with that of the same filter on
+unaltered measurements, and checks recovery after temporary alterations, ANEES, and the time of updates.
 
-The size of an error is the root of the mean over components of (error / scale)^2, the scale being the RMS error of the
-paper's algorithm on unaltered measurements: one number for every environment.
+The size of an error is the root of the mean over components of (error / scale)^2, with the RMS error of the
+paper's algorithm on unaltered measurements as scale.
 """
 
 import dataclasses
@@ -110,8 +108,7 @@ class StreamFilter(OnlineFilter):
         """Start the tracks with the task's initial estimate."""
         self._set_state(self._begin(initial, {}))
 
-    def _check_input(self, memory: Any) -> None:
-        """Do nothing, since there is no memory of an input to check."""
+    def _check_input(self, memory: Any) -> None: ...
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
         """Update with a measurement; return mean, covariance and statistics by name, arrays ``(..., N)``."""
@@ -122,7 +119,7 @@ class StreamFilter(OnlineFilter):
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
-    """Return the errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
+    """Return errors ``(K, C, N)`` of means at the first K measurements, angles as shortest differences."""
     means, truth = (numpy.moveaxis(values, 1, 0) for values in (means, stream.truth[: len(means)]))
     return numpy.moveaxis(stream.task.subtract(means, truth), 0, 1)
 
@@ -192,11 +189,7 @@ class CrashTest:
         return record_streams(model, seeds, length, chunk)
 
     def filter_of(self, name: str, maker: Any, tracks: int) -> StreamFilter:
-        """Return a competitor as an online filter without checks of its input.
-
-        Raises:
-            ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
-        """
+        """Make an online filter of a competitor, without checks of its input."""
         experiment = self.experiment
         keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
         chosen = dataclasses.replace(
@@ -257,15 +250,8 @@ class CrashTest:
     def findings(
         self, name: str, maker: Any, tick: Callable[[int], None] = lambda done: None
     ) -> Iterator[Finding]:
-        """Run a competitor under all alterations; yield the verdict under each.
-
-        Args:
-            name: name of the competitor.
-            maker: its maker, or the competitor itself.
-            tick: called with the number of alterations done.
-
-        Yields:
-            Verdict under each alteration.
+        """Run a competitor under all alterations, save and restore it, and run it long; yield a verdict on
+        each.
 
         Raises:
             ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
@@ -294,7 +280,7 @@ class CrashTest:
         return Finding(name, alteration, verdict, reason, **numbers, episodes=self.experiment.episodes)
 
     def _judge(self, name: str, alteration: str, stream: Stream, run: Run, plain: Run) -> Finding:
-        """Return the verdict on a filter under one alteration, from its run and that without alteration."""
+        """Judge a filter under one alteration, from its run and its run without alteration."""
         reference = self._reference.get(alteration)
         if alteration == UNALTERED:
             ratio = self._ratio(run, reference, stream, slice(SETTLED, None))
@@ -327,7 +313,7 @@ class CrashTest:
         return self._finding(name, alteration, DEGRADED if words else PASSED, "; ".join(words), **fields)
 
     def _failure(self, run: Run, plain: Run, stream: Stream, lost: numpy.ndarray) -> str:
-        """Return a sentence that describes why the filter failed; empty if it did not."""
+        """Explain in a sentence why the filter failed; empty if it did not."""
         count = stream.episodes
         if run.error:
             return f"stops at measurement {len(run.size) + 1}: {run.error}"
@@ -350,7 +336,7 @@ class CrashTest:
         return ""
 
     def _harm(self, alteration: str, fields: Mapping[str, Any]) -> Iterator[str]:
-        """Yield a sentence on the increase of the competitor's error, if it is above the limit ``HARM``."""
+        """Yield a sentence if the competitor's error increased by more than the limit ``HARM``."""
         error, other = fields["error"], fields["reference_error"]
         if not error > HARM:
             return
@@ -361,7 +347,7 @@ class CrashTest:
             yield f"error {_text(error)} times that without{beside}"
 
     def _inconsistency(self, alteration: str, anees: IntervalEstimate, plain: Run) -> Iterator[str]:
-        """Yield a sentence on ANEES, if the covariance is inconsistent."""
+        """Yield a sentence if the covariance is inconsistent by ANEES."""
         usual = 1.0 if alteration == UNALTERED else max(1.0, float(numpy.nanmean(plain.nees[SETTLED:])))
         if anees.low > INCONSISTENT * usual:
             yield f"overconfident, {_anees_text(anees)}"
@@ -385,13 +371,15 @@ class CrashTest:
         return ratio
 
     def _mean(self, values: numpy.ndarray) -> IntervalEstimate:
-        """Return the mean over measurements ``(K, N)`` and episodes, with its bootstrap interval over episodes."""
+        """Return the mean over measurements and episodes ``(K, N)``, with its bootstrap interval over
+        episodes.
+        """
         with numpy.errstate(all="ignore"):
             each = values.mean(axis=0) if len(values) else numpy.full(values.shape[1], numpy.nan)
             return self._bootstrap.estimate(each)
 
     def _restore(self, name: str, maker: Any) -> Finding:
-        """Return the verdict on a state saved in the middle and restored in another filter."""
+        """Judge whether a state saved in the middle and restored in another filter gives the same estimates."""
         count, stream = self.experiment.episodes, self._stream(UNALTERED)
         first = self.filter_of(name, maker, count)
         second = self.filter_of(name, maker, count)
@@ -417,7 +405,7 @@ class CrashTest:
         return self._finding(name, RESTORE, PASSED)
 
     def _long_streams(self) -> Iterable[Stream]:
-        """Return the streams of the long run; they are stored for the next filter unless they are too long."""
+        """Return the streams of the long run; short ones are stored for the next filter."""
         streams = self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK)
         if self.steps > MOST_KEPT:
             return streams
@@ -466,5 +454,4 @@ def _shortened(raised: Exception) -> str:
 
 
 def _text(value: float) -> str:
-    """Return a number as text with three digits."""
     return f"{value:.3g}" if value < 1e4 else f"{value:.1e}"

@@ -1,7 +1,6 @@
 """Simulated measurements of episodes as arrays over time, which can be altered before a filter receives them.
 
-A :class:`Stream` is recorded once from the simulation. The paper's algorithm closes the loop, and all filters receive
-the same measurements.
+The paper's algorithm closes the loop, and all filters receive the same measurements.
 """
 
 from collections.abc import Iterator, Sequence
@@ -47,7 +46,7 @@ class Stream:
 
     @property
     def reading_field(self) -> str:
-        """Name of the measurement's field with the readings of the sensors."""
+        """Name of the measurement's field that contains the sensors' readings."""
         world = type(self.task.world)
         return world.reading_field or world.received_field
 
@@ -88,11 +87,11 @@ class Stream:
         )
 
     def with_fields(self, **fields: Any) -> "Stream":
-        """Return a stream with some fields of the measurements replaced."""
+        """Return a stream with some fields of its measurements replaced."""
         return replace(self, measurements=self.measurements._replace(**fields))
 
     def with_readings(self, readings: numpy.ndarray) -> "Stream":
-        """Return a stream with the readings replaced, where readings were received."""
+        """Return a stream with other readings where readings were received."""
         return self.with_fields(**{self.reading_field: numpy.where(self.received, readings, self.readings)})
 
     @property
@@ -106,7 +105,7 @@ class Stream:
         return numpy.broadcast_to(available > 0.0, self.readings.shape)
 
     def with_times(self, seconds: numpy.ndarray) -> "Stream":
-        """Return a timed stream with the times of the measurements replaced, s, ``(K, N)``."""
+        """Return a timed stream with other times of its measurements, s, ``(K, N)``."""
         interval = numpy.diff(seconds, axis=0, prepend=0.0 * seconds[:1])
         fields = {"interval": interval}
         elapsed = type(self.task.world).elapsed_field
@@ -115,7 +114,7 @@ class Stream:
         return self.with_fields(**fields)
 
     def mark_missing(self) -> "Stream":
-        """Return a stream in which readings of NaN are set to not received, as the input of an online filter does."""
+        """Return a stream with readings of NaN marked as not received, as the input of an online filter does."""
         field, missing = type(self.task.world).received_field, numpy.isnan(self.readings)
         if not field or not missing.any():
             return self
@@ -124,7 +123,7 @@ class Stream:
         return self.with_fields(**{field: numpy.where(missing, 0.0, self.readings), "available": available})
 
     def renumber(self) -> "Stream":
-        """Return a stream with the scan numbers counted from 1 on, if measurements have such numbers."""
+        """Return a stream with scan numbers from 1 on, if measurements have such numbers."""
         counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
         if values is None:
@@ -143,17 +142,7 @@ def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.nd
 
 
 def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-    """Simulate episodes with the paper's algorithm in the loop; yield successive streams of their measurements.
-
-    Args:
-        model: model of the control of the paper's algorithm, with a horizon of at least ``length``.
-        seeds: seeds of the episodes.
-        length: number of measurements.
-        chunk: number of measurements of a stream.
-
-    Yields:
-        Streams that continue each other; the initial estimate is that of the first.
-    """
+    """Simulate episodes with the paper's algorithm in the loop; yield streams that continue each other."""
     task, count = model.on_numpy().task, len(seeds)
     began: list[Episode] = []
     lanes = start_lanes(model, seeds, began.append)

@@ -49,7 +49,7 @@ OWN = "The class is your own: put these values into it. A file that names a modu
 
 
 def price_words(price: Mapping[str, int] | None) -> str:
-    """Return the cost of an update of a filter in C, in words; empty where it is unknown."""
+    """Return the cost of an update of a filter in C as text: operations and bytes; empty where unknown."""
     if price is None:
         return ""
     return (
@@ -59,7 +59,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
-    """Return a function from a competitor's name and maker to the cost of an update in C: operations and bytes."""
+    """Return a function from a competitor's name and factory to the cost of its update in C."""
     parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
@@ -72,14 +72,9 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
 
 
 def fit_to_recording(problem: Problem, name: str, recording: Recording, folder: Path, seed: int) -> None:
-    """Fit one filter to a whole recording, print its parameters, and write them to a file.
+    """Fit one filter to a whole recording, print its parameters, and write them to a file in ``folder``.
 
-    Args:
-        problem: environment of the recording.
-        name: name of a filter that can be fitted, or ``module:Class``.
-        recording: the recording.
-        folder: folder of the file.
-        seed: seed of the starts of the fit.
+    ``name`` is a filter that can be fitted, or ``module:Class``.
     """
     families = families_of(problem, recording)
     if ":" not in name and name not in families:
@@ -225,7 +220,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return :func:`.advice_html`; raise ValueError if the packages of HTML reports are not installed."""
+    """Return the function that makes a page of advice; raise ValueError if its packages are not installed."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -48,7 +48,7 @@ def _cache() -> str:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Yield name and text of each extra: the versions of its packages, or which of them are missing."""
+    """Yield each extra, and as text the versions of its packages, or which of them are missing."""
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):
@@ -58,7 +58,7 @@ def _libraries() -> Iterator[tuple[str, str]]:
 
 
 def _is_in_extra(requirement: Requirement, extra: str) -> bool:
-    """Return whether a requirement belongs to an extra; the extra "" is the packages that are always required."""
+    """Return whether a requirement belongs to an extra; extra "" is the packages that are always required."""
     if requirement.marker is None:
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})

@@ -65,7 +65,7 @@ TRACKS = ("truth", "estimate", "covariance")
 
 
 class FileOptions(NamedTuple):
-    """Options of a command for reading flights and recordings from files."""
+    """Options for reading flights and recordings from files."""
 
     site: str | None
     longest_gap: float
@@ -82,7 +82,7 @@ class FileOptions(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Files that an evaluation writes, with their formats."""
+    """Files that an evaluation writes, with their formats, as requested."""
 
     folder: Path | None
     """Folder for records, a table, the whole result and figures."""
@@ -109,9 +109,7 @@ class Outputs(NamedTuple):
 
     @contextmanager
     def reserve_space(self, competitors: Sequence[Competitor]) -> Iterator[None]:
-        """Reserve disk space for the last outputs, as far as there is any, since the programs that run could fill the
-        disk.
-        """
+        """Reserve disk space for the last outputs while programs run that could fill the disk."""
         place = self.folder or self.records or self.estimates
         if place is None or not any(is_program(one.maker) for one in competitors):
             yield
@@ -130,7 +128,7 @@ def find_data(
     options: FileOptions,
     keywords: Mapping[str, Any],
 ) -> tuple[Problem, Any]:
-    """Return the problem, and its data: the name of a scenario, flights, or a recording, read from the files.
+    """Return the problem, and its data: the name of a scenario; or flights or a recording, read from files.
 
     Raises:
         ValueError: if the environment is not named, or a file cannot be read.
@@ -176,7 +174,7 @@ def _no_flights(name: str | None) -> ValueError:
 
 
 def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[str, float]:
-    """Return the noise levels by parameter that the first advised filter among ``names`` assumed for its log."""
+    """Return the noise levels, by parameter, that the first advised filter among the competitors assumed."""
     if environment is None:
         return {}
     advised = [name for name in names if name.endswith(SUFFIX)]
@@ -189,12 +187,7 @@ def find_participants(
 ) -> list[Competitor]:
     """Return the competitors to evaluate: the named ones, or those of the quick benchmark.
 
-    Args:
-        problem: the environment with its competitors.
-        data: data from :func:`find_data`. On a recording all shipped competitors run except references and bounds,
-            which need the truth.
-        policies: names from the command line; empty or None: the default ones.
-        trust: load models that can execute code.
+    On a recording the default is all shipped competitors except references and bounds, which need the truth.
     """
     known = problem.baselines
     if policies:
@@ -207,7 +200,7 @@ def find_participants(
 
 
 def causal_competitors(problem: Problem, recording: Recording, agents: bool = True) -> list[Competitor]:
-    """Return the shipped competitors that can run causally on a recording: classical, tuned and, if wanted, learned."""
+    """Return the shipped competitors that run causally on a recording: classical, tuned and, if wanted, agents."""
     found = find_competitors(problem, ranked_names(problem))
     # Random actions show nothing of a sensor.
     return [
@@ -229,13 +222,7 @@ def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
 
 
 def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
-    """Return whether the competitors' predictions of a recording are scored; not for more than MOST_PREDICTIONS.
-
-    Args:
-        problem: the environment with its competitors.
-        data: data from :func:`find_data`.
-        names: names of the competitors.
-    """
+    """Return whether the competitors' predictions of a recording are scored: not beyond ``MOST_PREDICTIONS``."""
     log_format = find_companion(problem.task, LogFormat)
     if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
         return False
@@ -248,7 +235,7 @@ def tables_of(
     width: int,
     user_names: Sequence[str] = (),
 ) -> list[Table]:
-    """Return an evaluation's tables, at most ``width`` columns wide; rows of the user's competitors are marked."""
+    """Return an evaluation's tables, at most ``width`` wide; rows of the user's competitors are marked."""
     tables = (
         [flights_table(evaluation.dataset, evaluation.flights, evaluation.records, width)]
         if evaluation.flights
@@ -268,13 +255,13 @@ def tables_of(
 
 
 def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
-    """Return those of the given names that are not shipped with the package: the user's own competitors."""
+    """Return the given names that are not shipped with the package: the user's own competitors."""
     shipped = shipped_names(problem)
     return [name for name in dict.fromkeys(policies) if name not in shipped]
 
 
 def _missing_comparison(problem: Problem) -> str:
-    """Return the sentence that explains why costs are not compared where the paper's algorithm does not take part."""
+    """Return a sentence on why costs are not compared with the paper's algorithm."""
     paper = problem.baselines.compared_paper
     if not paper:
         return "Costs are not compared: the environment names no paper's algorithm."
@@ -286,13 +273,7 @@ def run(
 ) -> tuple[Evaluation, str, dict[str, str]]:
     """Run the competitors of an evaluation, and return the results; a failing one loses only its own row.
 
-    Every number of every episode is stored only on request.
-
-    Args:
-        requests: one for each competitor.
-        outputs: what will be written.
-        workers: processes that share the work.
-        store: storage of finished results until all is written.
+    Every number of every episode is stored only on request; ``store`` holds results until all is written.
 
     Returns:
         The evaluation, why it is not written as a whole (empty if it is), and the errors of failed competitors.
@@ -353,14 +334,7 @@ def write(
 ) -> None:
     """Write the requested files of an evaluation, and print its tables, sentences and the files' paths.
 
-    Args:
-        problem: the evaluated problem.
-        evaluation: the evaluation of :func:`run`.
-        refusal: why the whole of it is not written, from :func:`run`.
-        outputs: files to write.
-        learned: names of learned agents.
-        worst: worst episodes of the competitors whose cost is explained, by name.
-        user_names: names of the user's own competitors.
+    ``refusal`` is the reason, from :func:`run`, why the whole evaluation is not written.
     """
     printed, in_file = (
         tables_of(problem, evaluation, width, marked)
@@ -428,7 +402,7 @@ def write(
 
 
 def missing_rows(records: Sequence[Any]) -> Iterator[str]:
-    """Yield a sentence for each competitor whose file of estimates lacks measurements, with their number."""
+    """Yield a sentence for each competitor whose file of estimates lacks rows, with their share."""
     for record in records:
         if record.metric == "missing" and record.value:
             yield (
@@ -440,14 +414,7 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Yield lines on the noise levels that agents observe of a log, and on how the log departs from their training.
-
-    Args:
-        problem: environment of the agents.
-        data: scenario, flights or recording.
-        learned: the agents.
-        keywords: parameters of the task.
-    """
+    """Yield lines on the noise levels that agents observe of a log, and on how it departs from their training."""
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
         yield (

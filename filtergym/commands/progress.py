@@ -14,18 +14,14 @@ STEP = 0.05
 
 
 class _Bar(Progress):
-    """A progress bar that disappears at the end."""
-
     def write_line(self, text: str) -> None:
         """Ignore the line: the bar shows the progress."""
 
 
 class ProgressLines:
-    """Progress as few lines of text with the remaining time, where there is no terminal; none for tasks of seconds.
+    """Progress of a task as few lines of text with the remaining time; none for tasks of seconds.
 
-    Args:
-        write: function that writes a line.
-        clock: function that returns the time, s.
+    ``clock`` returns the time, s.
     """
 
     def __init__(self, write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:

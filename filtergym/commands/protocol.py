@@ -51,17 +51,8 @@ def evaluate_protocol(
 ) -> None:
     """Run a protocol and print its table, the row to quote and a BibTeX entry.
 
-    Args:
-        name: name of the protocol, or a path.
-        policies: competitors, see ``words`` of :func:`..protocol.find_entries`.
-        workers: processes that share the work.
-        json: file for the records of all scenarios; None: none.
-        trust: load models that can execute code.
-        rename: function that replaces names, see :func:`..protocol.find_entries`.
-        **options: further arguments of :func:`..protocol.run_protocol`.
-
-    Raises:
-        ValueError: as these functions raise it.
+    ``policies`` are words, and ``rename`` a function, of :func:`..protocol.find_entries`; ``json`` is a file
+    for the records; options are those of :func:`..protocol.run_protocol`.
     """
     if json is not None:
         writable_file(json)
@@ -82,7 +73,7 @@ def evaluate_protocol(
 
 
 def quoted_row(result: ProtocolResult) -> list[str]:
-    """Return the lines of a Markdown table with one row, the result to quote; its last column is the time."""
+    """Return a Markdown table with one row, line by line: the protocol's result to quote."""
     cells = {
         result.protocol.name: result.title,
         "cost against the papers, %": _percent(result.cost),
@@ -124,7 +115,7 @@ def _table(found: ProtocolResult) -> Table:
         "are held out from training the worst is named. ns is the competitor's processor time of a measurement on one "
         "core of this machine."
     )
-    if not found.complete:
+    if not found.is_complete:
         table.caption += "\nNot all environments were entered: there is no number over all."
     return table
 

@@ -32,11 +32,7 @@ def print_headline(results: Sequence[Result]) -> None:
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:
-    """Return :func:`.report_html`, which makes a page of results.
-
-    Raises:
-        ValueError: if the packages that it needs are not installed.
-    """
+    """Return the function :func:`.report_html`, which makes a page of results."""
     try:
         from ..reports.pages.html_report import report_html
     except ImportError as error:
@@ -45,11 +41,7 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
 
 
 def make_report(results: Sequence[Result], settings: Settings, out: Path) -> None:
-    """Write a report and print its path; print the reason if packages for it are missing.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Write a report and print its path; print the reason if packages for it are missing."""
     try:
         maker = report_maker()
     except ValueError as error:

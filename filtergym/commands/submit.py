@@ -198,7 +198,7 @@ def _percent(figure: Figure | None) -> str:
 
 
 def _time_line(columns: dict[str, tuple[Figure, ...]]) -> str:
-    """Return the processor time of a measurement in each run, ns, as one line of text."""
+    """Return the processor time of a measurement in each run as one line of text."""
     times = {
         name: f.value for name, figures in columns.items() for f in figures if f.metric == TIME and f.value
     }

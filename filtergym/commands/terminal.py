@@ -35,7 +35,7 @@ def complete_environment(incomplete: str) -> list[str]:
 
 
 def import_environments(value: Any) -> Any:
-    """Import the module of each environment given as ``module:id``; return the argument unchanged."""
+    """Import the modules of environments given as ``module:id``; return the argument unchanged."""
     from ..envs.engine.catalogue import import_task
 
     for word in [value] if isinstance(value, str) else value or ():
@@ -45,7 +45,7 @@ def import_environments(value: Any) -> Any:
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:
-    """Return the environment id in a command line that is being completed, or all ids if it contains none."""
+    """Return the id of the environment named in a command line to complete, in a list; else all ids."""
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
@@ -197,7 +197,7 @@ PAGE_WIDTH = 100
 
 
 class Output(Console):
-    """Console on standard output; after an error of writing it prints nothing more, and the command continues."""
+    """Console on standard output that falls silent after an error of writing, while the command continues."""
 
     refusal: OSError | None = None
     """Error that ended the output; None while it works, and where the reader of a pipe has closed it."""
@@ -211,7 +211,7 @@ class Output(Console):
             self._end()
 
     def on_broken_pipe(self) -> None:
-        """Print nothing more after the reader of a pipe has closed it; rich would exit."""
+        """Fall silent after the reader of a pipe has closed it; rich would exit."""
         self._end()
 
     def _end(self) -> None:
@@ -232,7 +232,7 @@ console: Output = Output(width=output_width(), markup=False, emoji=False)
 
 
 def fill(sentence: str, width: int) -> str:
-    """Return a sentence broken into lines of ``width`` characters, never inside an interval or before a unit."""
+    """Return a sentence broken into lines of ``width`` characters, not inside intervals or before units."""
     kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
     return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
@@ -245,7 +245,7 @@ def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> Non
 
 
 def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
-    """Print a table at its full width, with its title above and its notes below in lines of ``width``."""
+    """Print a table at its full width, its title above it, and its notes below."""
     title, notes = table.title, table.caption
     table.title = table.caption = None
     if title:
@@ -260,17 +260,13 @@ def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
 
 
 def open_output() -> None:
-    """Make standard output escape the characters that its encoding lacks, such as ASCII."""
+    """Make standard output escape the characters that its encoding lacks."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def close_output(*_: Any, **__: Any) -> None:
-    """Raise the error that ended standard output, if there was one; called at the end of a command.
-
-    Raises:
-        ValueError: if the output could not be written.
-    """
+    """Raise ValueError if standard output has failed; called at the end of a command."""
     if console.refusal is not None:
         raise ValueError(
             f"cannot write to standard output: {console.refusal.strerror or console.refusal}"
@@ -285,11 +281,7 @@ def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> No
 
 
 def parse_renames(text: str | None) -> dict[str, list[str]]:
-    """Parse an option such as ``t=time,pos=x`` into the columns of the package by each name in the file.
-
-    Raises:
-        ValueError: for text in another form.
-    """
+    """Parse an option such as ``t=time,pos=x``; return the package's columns by each name in the file."""
     pairs = [part.split("=") for part in text.split(",")] if text else []
     if not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
         raise ValueError(
@@ -327,7 +319,7 @@ def parse_whole_numbers(option: str, text: str) -> list[int]:
 
 
 def command_line() -> str:
-    """Return the running command as a user would type it."""
+    """Return the running command as a shell would take it."""
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 

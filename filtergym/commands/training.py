@@ -29,11 +29,7 @@ class Training(NamedTuple):
 
 
 def trainer_of(algo: str) -> Trainer:
-    """Return the function that trains with an algorithm: from a run and a session to the trained run.
-
-    Raises:
-        ValueError: if it needs packages that are not installed.
-    """
+    """Return the function that trains with an algorithm: ``(run, session) -> run``."""
     try:
         import torch
 
@@ -50,12 +46,7 @@ def trainer_of(algo: str) -> Trainer:
 
 
 def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
-    """Return a training run, begun in the folder of a session or continued there, with its session.
-
-    Args:
-        problem: training problem.
-        options: options of the run.
-        session: settings of the training.
+    """Begin a training run in a folder, or continue the one there; return it with its session.
 
     Raises:
         ValueError: as of :func:`.training_run.new_run` and :func:`.training_run.open_run`.
@@ -68,13 +59,9 @@ def open_run(problem: Problem, options: RunOptions, session: Session) -> Trainin
 def open_runs(
     problem: Problem, options: RunOptions, session: Session, seeds: Sequence[int]
 ) -> list[Training]:
-    """Begin or continue a run for each seed, in folders that end with a dash and the seed.
+    """Begin or continue a run for each seed, in folders that end with a dash and the seed; return them all.
 
-    Args:
-        problem: training problem.
-        options: options of every run, except the seed.
-        session: settings of the training; its folder is the beginning of the runs' folders.
-        seeds: seeds of the runs.
+    The folder of the session is the beginning of the runs' folders.
 
     Raises:
         ValueError: as of :func:`open_run`, and for a checkpoint that can execute code and is not trusted.
@@ -99,13 +86,7 @@ def _training(run: TrainingRun, session: Session) -> Training:
 
 
 def train_runs(trainings: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
-    """Train the unfinished runs, and return the final state of all runs.
-
-    Args:
-        trainings: runs of one algorithm.
-        trainer: of the algorithm.
-        workers: processes that share the runs.
-    """
+    """Train the unfinished runs of one algorithm with its ``trainer``; return the final state of all runs."""
     waiting = []
     for training in trainings:
         if training.session.resume and training.run.is_complete:
@@ -120,7 +101,6 @@ def train_runs(trainings: Sequence[Training], trainer: Trainer, workers: Workers
 
 
 def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
-    """Train runs one after another in this process, until a request to stop."""
     for training in waiting:
         _train_here(training, trainer)
         if not training.run.is_complete:
@@ -142,10 +122,7 @@ def _train_here(training: Training, trainer: Trainer) -> None:
 
 
 def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train runs in parallel processes, and return each finished run by its folder.
-
-    The reports of a run are printed when it has ended.
-    """
+    """Train runs in parallel processes; return those that have begun by their folders, and print their reports."""
     found = {}
     sizes = [training.run.steps for training in waiting]
     with progress_bar() as bar:
@@ -165,7 +142,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
 
 
 def _train(training: Training, tick: Any) -> list[str]:
-    """Train a run in a separate process, and return its reports, sentences on its validations."""
+    """Train a run in a separate process, and return the sentences that it reports."""
     lines: list[str] = []
     _, run, session = training
     trainer_of(run.algorithm)(run, replace(session, report=lines.append))
@@ -177,12 +154,7 @@ def _print_done(folder: Path, run: TrainingRun) -> None:
 
 
 def print_standing(trainings: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
-    """Print how the best agents of runs that differ in their seed compare with untrained competitors.
-
-    Args:
-        trainings: of :func:`open_run`.
-        runs: of :func:`train_runs`.
-    """
+    """Print how the best agents of runs that differ in their seed compare with untrained competitors."""
     agents = [best_agent(training.folder) for training in trainings]
     trust = trainings[0].session.trust
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:

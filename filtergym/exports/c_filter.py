@@ -33,18 +33,12 @@ TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a filter's files, which also begins its functions: the competitor's as an identifier of C."""
+    """Return a competitor's name as a C identifier, which begins the names of its files and functions."""
     return identifier(name, TAKEN)
 
 
 class FilterText:
-    """The text of a filter in C: structs, ``start`` and ``update``, header and source.
-
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
+    """Writer of a filter's header and source in C, with the functions ``start`` and ``update``.
 
     Attributes:
         about: paragraphs for the comment of the header.
@@ -68,7 +62,7 @@ class FilterText:
         self.update, self.update_source = self._update()
 
     def _parameters(self, *parts: str) -> list[Parameter]:
-        """Return function parameters of C that point to structs; those that are only read are ``const``."""
+        """Return C function parameters that point to the structs ``parts``, ``const`` where only read."""
         return [
             Parameter(
                 f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
@@ -78,7 +72,7 @@ class FilterText:
         ]
 
     def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Return a struct seen as one array of its numbers, in the order of a program's argument."""
+        """Return a struct of C seen as one array, with its numbers in the order of a program's argument."""
         pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
         return Rows(pointer, self.structs[part].numbers)
 
@@ -211,7 +205,7 @@ class FilterText:
         ]
 
     def _return_statement(self) -> str:
-        """Return the C statement that returns ``TAKEN`` after a received measurement, else ``MISSED``."""
+        """Return the C statement that returns ``TAKEN`` if a part of the measurement was received, else ``MISSED``."""
         own, zero = self.name.upper(), literal(0.0, self.scalar)
         there = [
             p for p in self.structs["measurement"].places.values() if re.fullmatch(r"available(\[\d+\])*", p)
@@ -223,7 +217,7 @@ class FilterText:
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
-        """Operations of an update, and bytes of state, network weights and stack."""
+        """Number of operations of an update, and bytes of state, network weights and stack."""
         size = numpy.dtype(self.scalar.dtype).itemsize
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
@@ -245,7 +239,7 @@ class FilterText:
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
-        """Return the text of the header file; ``notes`` are paragraphs for its comment."""
+        """Return the text of the C header file; ``notes`` are paragraphs for its comment."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
@@ -306,7 +300,7 @@ class FilterText:
         return "\n".join(text)
 
     def source(self) -> str:
-        """Return the text of the source file."""
+        """Return the text of the C source file: network, ``start`` and ``update``."""
         parts = [
             comment(
                 "See the header. A loop goes over the members of array operations, k is the member; tables, whose "

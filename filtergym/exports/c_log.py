@@ -1,6 +1,4 @@
-"""Text of the program that reads a user's log; its formats and limits are taken from the declarations of the Python
-reader.
-"""
+"""Text of the C program that reads a user's log, with the formats and limits of the Python reader."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -69,15 +67,9 @@ LOOK_VALUES = {
 
 
 class LogText(FilterText):
-    """The text of a filter in C, and of the program that runs it over a user's log.
+    """Writer of a filter in C, and of the C program that runs it over a user's log.
 
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
-        log_format: log format of the environment; None where it reads no logs.
-        columns: names in the log of renamed columns.
+    ``columns`` are the names in the log of renamed columns.
     """
 
     def __init__(
@@ -95,19 +87,19 @@ class LogText(FilterText):
         self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
-        """Return the column names of a table for a struct, in the order of its numbers."""
+        """Return the column names of a struct in a table, in the order of its numbers."""
         names = self.structs[part].columns
         begin = "initial_" if part == "initial" else ""
         return [f"{begin}{names[row]}" for row in sorted(names)]
 
     @property
     def initial_estimate(self) -> list[float]:
-        """Initial estimate of the model, the same for all tracks, in the order of its struct; empty for other logs."""
+        """Initial estimate of a state-space model, as flat mean and covariance; empty for logs of other kinds."""
         rows = self.plain_rows
         return [] if rows is None else [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
 
     def source_of(self, name: str) -> tuple[str, int]:
-        """Return where a row of a log contains a number of a measurement: its kind, and its place in that kind."""
+        """Return the place of a measurement's number in a row of a log: kind of column, and index in that kind."""
         kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
         kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
         return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
@@ -115,11 +107,8 @@ class LogText(FilterText):
     def fill(self, received: str, inputs: str, interval: str, others: Sequence[str] = ()) -> str:
         """Return the C statements that fill the measurement ``given`` from a row of a log.
 
-        Args:
-            received: expression of the first received number; the others follow it.
-            inputs: expression of the first input; the others follow it.
-            interval: expression of the interval.
-            others: expressions of all other numbers, in their order; default: zero.
+        ``received`` and ``inputs`` are C expressions of the first such number, ``others`` of all other
+        numbers.
         """
         lines, rest = [], iter(others)
         for row, name in enumerate(self.columns("measurement")):
@@ -137,7 +126,7 @@ class LogText(FilterText):
     # --- the program
 
     def log_program(self, request: "ExportRequest") -> str:
-        """Return the text of the C program that reads a user's log; empty where the log's format is not supported."""
+        """Return the text of the C program that reads a user's log; empty for an unsupported format."""
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
         log, log_format = request.log, self.log_format
@@ -183,12 +172,7 @@ class LogText(FilterText):
         return f"{text}{READER}\n{follow}"
 
     def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
-        """Return the text of the C program for a log whose rows are measurements without conversion.
-
-        Args:
-            rows: format of the rows.
-            interval: interval between rows that the user has set, s.
-        """
+        """Return the text of the C program for a log whose rows are measurements without conversion."""
         names = [self.log_columns.get(name.lower(), name).lower() for name in (*rows.received, *rows.inputs)]
         follow = PLAIN_ROWS.format(
             own=self.name,
@@ -204,7 +188,7 @@ class LogText(FilterText):
         return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
-        """Return the text of the C program for plots, read as for the filter's fit; empty for other logs."""
+        """Return the text of the C program for a log of plots (x, y or polar); empty for other logs."""
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
         second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
@@ -247,12 +231,7 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Return the text of the C program for rows at one rate, read as for the filter's fit; empty for other logs.
-
-        Args:
-            numbers: constants of the reading.
-            log: options with which the log of the fit was read.
-        """
+        """Return the text of the C program for a log of rows at one rate; empty for other logs."""
         if "range_rate" in log.columns:
             rows = _rows_with_looks(log.columns, numbers)
         elif {"ins", "ins_x"} & {*log.columns}:
@@ -273,7 +252,7 @@ class LogText(FilterText):
         return self._log(about, follow, columns, rows.needed, {"UNEVEN": UNEVEN, **rows.limits})
 
     def _assign(self, part: str, values: Mapping[str, str], indent: str) -> str:
-        """Return the C statements that set every number of a struct; those not in ``values`` become zero."""
+        """Return the C statements that set all numbers of a struct; those not in ``values`` become zero."""
         columns = sorted(self.structs[part].columns.items())
         return f"\n{indent}".join(f"given[{row}] = {values.get(name, '0.0')};" for row, name in columns)
 
@@ -306,12 +285,11 @@ class RegularReading(NamedTuple):
 
 
 def _all_columns(first: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Return the column names ``first``, then all others of a log except time and recording."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
 
 def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading:
-    """Return the reading of a log of INS and receiver positions; ``usual`` is the receiver's default deviation, m."""
+    """Return how C reads a log of INS and receiver positions; ``usual`` is the default deviation, m."""
     ends = [""] if "ins" in columns else sorted(name[3:] for name in columns if name.startswith("ins_"))
     A, stated = len(ends), int("sigma" in columns)
     first = [*(f"ins{end}" for end in ends), *["sigma"] * stated, *(f"fix{end}" for end in ends)]
@@ -333,7 +311,7 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
 
 
 def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -> RegularReading:
-    """Return the reading of rows of a radar with ESM reports; ``numbers`` are the format's constants."""
+    """Return how C reads a log of a radar with ESM reports; ``numbers`` are constants of the format."""
     first = ["range", "range_rate", *(name for name in columns if name == "looked")]
     names = _all_columns(first, columns)
     optional = ("looked", "decision", "bearing_difference", "radar_bearing", "esm_bearing")
@@ -348,7 +326,6 @@ def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -
 
 
 def _number(value: float) -> str:
-    """Return a number as a literal of C, a whole one without a decimal point."""
     return str(value) if isinstance(value, int) else literal(value)
 
 
@@ -365,7 +342,7 @@ def _quote(text: str) -> str:
 
 
 def name_list(text: str) -> str:
-    """Return a comma-separated text of identifiers as a string literal of C, broken into lines."""
+    """Return comma-separated identifiers as a C string literal, broken into lines."""
     assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
     pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
     return "\n    ".join(f'"{piece}"' for piece in pieces)

@@ -50,7 +50,7 @@ for (i = 0; i < {units}; ++i) {{
 
 
 def memory_size(network: "LearnedPolicy") -> int:
-    """Return the number of values in a recurrent network's memory; 0 without recurrence."""
+    """Return the number of values in the memory of a network; 0 without recurrence."""
     arrays = network.arrays
     if "gru_memory_weight" in arrays:
         return int(arrays["gru_memory_weight"].shape[1])
@@ -58,7 +58,7 @@ def memory_size(network: "LearnedPolicy") -> int:
 
 
 def network_operations(network: "LearnedPolicy") -> int:
-    """Return the multiplications and additions of a network's layers, without its activations."""
+    """Return the number of multiplications and additions of a network, without its activations."""
     sizes = {key: int(values.size) for key, values in network.arrays.items()}
     return sum(2 * size for key, size in sizes.items() if "weight" in key) + sum(
         size for key, size in sizes.items() if "bias" in key
@@ -66,27 +66,17 @@ def network_operations(network: "LearnedPolicy") -> int:
 
 
 def scratch_size(network: "LearnedPolicy") -> int:
-    """Return the number of values that a network needs on the stack."""
+    """Return the number of values that a network's C code needs on the stack."""
     return _width(network) * (3 if memory_size(network) else 2)
 
 
 def _width(network: "LearnedPolicy") -> int:
-    """Return the largest width of a network's layers and input, in values."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 
 
 def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[str, int]:
-    """Return the C text of a network as ``NAME_network(shown, memory, answer)``, and the bytes of its constants.
-
-    Args:
-        network: network to write.
-        name: beginning of all names.
-        scalar: type in which it computes.
-
-    Returns:
-        Its text, and the bytes of its constants.
-    """
+    """Return the C function ``NAME_network(shown, memory, answer)`` of a network, and the bytes of its constants."""
     arrays = {
         # Of a matrix its columns one after the other.
         key: numpy.ascontiguousarray(values.T)
@@ -139,7 +129,7 @@ def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[s
 
 
 def _answer(network: "LearnedPolicy", count: int, scalar: Scalar) -> list[str]:
-    """Return the C statements that compute the ``count`` action values from the last layer."""
+    """Return the C statements that convert the last layer's outputs to ``count`` action values."""
     if network.output == "argmax":
         return [
             "{",

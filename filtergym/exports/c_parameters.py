@@ -41,7 +41,7 @@ def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
 
 
 def parameter_words(free: FreeParameters) -> str:
-    """Return the sentences about the parameters' struct, for the comment of the header."""
+    """Return the sentences on a filter's parameters for the comment of its C header."""
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
@@ -66,12 +66,6 @@ def parameter_text(
     """Return the C tables and functions of the parameters, and the first statements of ``start``.
 
     The statements reject values outside the limits, and compute the numbers ``own`` that the filter derives.
-
-    Args:
-        name: name of the filter.
-        free: its parameters.
-        scalar: type of the numbers.
-        struct: struct of the parameters.
     """
     if free.derive is None:
         return "", []
@@ -133,7 +127,7 @@ def parameter_text(
 
 
 def _merge_by_depth(code: StraightLineProgram) -> StraightLineProgram:
-    """Return a program with equal operations at equal depth joined into array operations, which C writes as loops."""
+    """Return a program whose equal operations at equal depth are marked as one array operation, a loop in C."""
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
     own = []
@@ -144,12 +138,12 @@ def _merge_by_depth(code: StraightLineProgram) -> StraightLineProgram:
 
 
 def _stored_rows(free: FreeParameters, scalar: Scalar) -> range:
-    """Return the rows of derived numbers that the C text stores for the default parameters."""
+    """Return the rows of derived numbers that the C text stores as constants for default parameters."""
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Return the C statements that reject pairs that do not ascend, and probabilities that do not sum to one."""
+    """Return C statements that reject pairs that do not ascend and probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]

@@ -49,15 +49,9 @@ VECTORS = 2, 50
 
 
 class Writer(LogText):
-    """The C files of a filter: header, source, program for tables, test and its vectors.
+    """Writer of all C files of an exported filter: header, source, programs, test and its vectors.
 
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
-        log_format: log format of the environment; None where it reads no logs.
-        columns: names in the log of renamed columns.
+    ``columns`` are the names in the log of renamed columns.
 
     Attributes:
         limit: largest difference with which the test passes, standard deviations.
@@ -76,7 +70,7 @@ class Writer(LogText):
         self.limit: float = WORST[scalar.name]
 
     def rows(self) -> str:
-        """Return the text of a C header with functions that fill the structs from rows of a table."""
+        """Return the text of rows.h: functions that fill the structs from rows of a table."""
         own, real = self.name, self.scalar.name
         text = [
             comment("Structs from rows of a table."),
@@ -92,7 +86,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def main(self) -> str:
-        """Return the text of main.c, which reads a table of measurements and writes a table of estimates."""
+        """Return the text of main.c, which runs the filter from a table of measurements to one of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
         initial, measurement = self.columns("initial"), self.columns("measurement")
         given = self.table_columns()
@@ -162,7 +156,7 @@ class Writer(LogText):
         return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self.initial_estimate)), fill=fill)
 
     def test(self) -> str:
-        """Return the text of the C test, which compares the filter with the stored estimates."""
+        """Return the text of test.c, which compares the filter's estimates with the stored ones."""
         return TEST.format(
             own=self.name,
             upper=self.name.upper(),
@@ -172,7 +166,7 @@ class Writer(LogText):
         )
 
     def vectors(self, replayed: Replay) -> str:
-        """Return the text of the C header with the test's measurements and expected estimates."""
+        """Return the text of vectors.h: measurements of the test, and the expected estimates."""
         E, T = min(VECTORS[0], replayed.initial.shape[1]), min(VECTORS[1], len(replayed.measurements))
         arrays = {
             "initials": replayed.initial[:, :E].T,
@@ -205,7 +199,7 @@ class Writer(LogText):
         return "\n".join([*lines, ""])
 
     def _plain_row(self, row: Sequence[float]) -> list[str]:
-        """Return the cells of a measurement in a table with the columns of a log, except the first cell."""
+        """Return the cells of a measurement in a table with a log's columns, without the first, the recording."""
         found: dict[str, list[str]] = {"interval": [], "received": [], "held": [], "other": []}
         there = [
             value > 0.0
@@ -220,13 +214,9 @@ class Writer(LogText):
 
 
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
-    """Write a competitor as C99 into a folder, after a comparison with the Python competitor; return the figures.
+    """Compare a competitor's program with its Python form, and write it as C99; return cost and accuracy.
 
-    Args:
-        request: the competitor.
-        folder: folder of the files.
-        precision: "double" or "float".
-        command: command of the export, for the comment of the header.
+    ``precision`` is "double" or "float".
 
     Raises:
         ValueError: for a competitor that cannot be exported, or differs in this precision.
@@ -267,7 +257,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
 
 
 def price_of(request: ExportRequest) -> dict[str, int] | None:
-    """Return the operations of an update in C, and bytes of state and stack; None if it cannot be exported."""
+    """Return the operations of an update in C, and bytes of state, weights and stack; None: not exportable."""
     try:
         traced, replayed = replay(request, EPISODES, 2)
     except ValueError:
@@ -336,16 +326,7 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
 def compile_and_test(
     writer: Writer, replayed: Replay, compiler: str | None = None, flags: Sequence[str] = FLAGS
 ) -> str:
-    """Compile the C test, run it, and return its output.
-
-    Args:
-        writer: writer of the filter.
-        replayed: the vectors.
-        compiler: path of the compiler; default: cc, where there is one.
-        flags: compiler flags.
-
-    Returns:
-        The output of the test; empty without a compiler.
+    """Compile the C test, run it, and return its output; empty without a compiler.
 
     Raises:
         ValueError: if it does not compile, or the test fails.

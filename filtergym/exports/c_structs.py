@@ -10,7 +10,7 @@ from .traced_filter import Member
 
 
 class Structure(NamedTuple):
-    """A struct of C: its arrays, and the places of numbers in it."""
+    """A struct of C: its member arrays, the C expression of each number, and its column in a table."""
 
     name: str
     arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
@@ -22,13 +22,13 @@ class Structure(NamedTuple):
 
     @property
     def numbers(self) -> dict[int, int]:
-        """For each row of the argument its place among the numbers of the struct."""
+        """Index of each program row's number in the struct seen as one array."""
         rows = [row for _, _, _, own in self.arrays for row in own]
         return {row: place for place, row in enumerate(rows)}
 
 
 def structure(name: str, members: Sequence[Member]) -> Structure:
-    """Return the struct of C for numbers of arrays: a whole array is a member, of others each entry."""
+    """Return the C struct of some numbers: of an array in full one array member, else a member for each number."""
     groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
     for row, member in enumerate(members):
         groups.setdefault((member.name, member.shape), []).append(row)

@@ -1,9 +1,8 @@
 """The network of an agent as an ONNX graph: observation and memory in, action and memory out.
 
-The graph is that of :class:`~filtergym.agents.learned_policy.LearnedPolicy`, in the primitive operators that every
-runtime has: normalisation, the gates of the recurrent unit as matrix products, the layers, and the conversion of the
-last one to an action. Everything is float32. Estimation is not in it: the observation is that of the environment's
-filter.
+The graph is that of :class:`~filtergym.agents.learned_policy.LearnedPolicy` in primitive operators and float32:
+normalisation, recurrent unit, layers, and the conversion to an action. The observation is that of the environment's
+filter, which is not in the graph.
 """
 
 import json
@@ -27,11 +26,7 @@ BATCH = "N"
 
 
 class _Graph:
-    """Nodes and constants of an ONNX graph under construction.
-
-    Args:
-        onnx: the package.
-    """
+    """Nodes and constants of an ONNX graph under construction; ``onnx`` is the package."""
 
     def __init__(self, onnx: Any) -> None:
         self.onnx = onnx
@@ -39,31 +34,30 @@ class _Graph:
         self.constants: dict[str, Any] = {}
 
     def constant(self, name: str, values: Any, dtype: Any = numpy.float32) -> str:
-        """Add an array as a constant, once for each name; return its name."""
+        """Add an array to the graph as a constant, once for each name; return its name."""
         array = numpy.ascontiguousarray(values, dtype=dtype)
         self.constants.setdefault(name, self.onnx.numpy_helper.from_array(array, name))
         return name
 
     def node(self, operator: str, inputs: list[str], *outputs: str, **attributes: Any) -> str:
-        """Add an operation; return the name of its first output."""
+        """Add an operation to the graph; return the name of its first output."""
         names = list(outputs) or [f"{operator.lower()}_{len(self.nodes)}"]
         self.nodes.append(self.onnx.helper.make_node(operator, inputs, names, names[0], **attributes))
         return names[0]
 
     def split(self, whole: str, count: int, width: int, name: str) -> list[str]:
-        """Add a split of columns into ``count`` parts of ``width``; return their names."""
+        """Add a split of columns into parts to the graph; return the parts' names."""
         parts = [f"{name}_{i}" for i in range(count)]
         sizes = self.constant(f"{name}_widths", [width] * count, numpy.int64)
         self.node("Split", [whole, sizes], *parts, axis=1)
         return parts
 
     def linear(self, rows: str, weight: str, bias: str) -> str:
-        """Add ``rows @ weight.T + bias``; return the name of the output."""
         return self.node("Gemm", [rows, weight, bias], transB=1)
 
 
 def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
-    """Add the normalisation of the observation ``(x - mean) / scale``, clipped; return its name."""
+    """Add the clipped ``(observation - mean) / scale`` to the graph; return its name."""
     limit = [graph.constant(n, v) for n, v in (("low", -OBSERVATION_LIMIT), ("high", OBSERVATION_LIMIT))]
     mean, scale = (graph.constant(n, arrays[n]) for n in ("observation_mean", "observation_scale"))
     centred = graph.node("Sub", ["observation", mean])
@@ -86,8 +80,9 @@ def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
 
 
 def _long_short_term(graph: _Graph, x: str, width: int) -> str:
-    """Add a step of the long short-term memory (Gers et al., 2000); return the name of its output. Its memory contains
-    the output, then the cells.
+    """Add a step of the long short-term memory (Gers et al., 2000); return the name of its output.
+
+    The memory has the output first, then the cells.
     """
     shown, cells = graph.split("memory", 2, width, "memory_part")
     from_input = graph.linear(x, "lstm_input_weight", "lstm_input_bias")
@@ -102,7 +97,7 @@ def _long_short_term(graph: _Graph, x: str, width: int) -> str:
 
 
 def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
-    """Add the conversion of the last layer to an action: clipped to the box, squashed, or the largest entry's index."""
+    """Add the conversion of the last layer to an action: clipped, squashed by tanh, or the largest one's index."""
     if output == "argmax":
         graph.node("ArgMax", [x], "action", axis=1, keepdims=0)
         return
@@ -117,11 +112,7 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
 
 
 def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
-    """Return the stored arrays of an agent, and the model of its environment.
-
-    Raises:
-        ValueError: for an agent that has no plain arrays, or does not fit the environment.
-    """
+    """Return an agent's stored network, and the model of its environment."""
     maker = request.maker
     stored = maker.policy if isinstance(maker, EstimatorMaker) else maker
     if not isinstance(stored, StoredPolicy):
@@ -135,12 +126,7 @@ def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
 
 
 def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
-    """Return the metadata of an ONNX file as texts by key: names, units and meaning of inputs and outputs.
-
-    Args:
-        stored: arrays of the agent.
-        model: model of its environment.
-    """
+    """Return the metadata of a network's ONNX file: environment, fields with units, actions, as texts by key."""
     header, space = stored.header, model.action_space
     known = {field.name: field for field in model.fields}
     fields = [known[field] for field in header["fields"]]
@@ -168,15 +154,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
 
 
 def network_graph(stored: StoredPolicy, model: Model) -> Any:
-    """Return a network as an ONNX model: observation and memory in, action and memory out.
-
-    Args:
-        stored: arrays of the agent.
-        model: model of its environment.
-
-    Raises:
-        ValueError: if the package is not installed.
-    """
+    """Return an agent's stored network as an ONNX model: observation and memory in, action and memory out."""
     try:
         import onnx
     except ImportError as error:
@@ -224,10 +202,6 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
 
 def export_onnx(request: ExportRequest, path: Path) -> None:
     """Write the network of an agent as an ONNX file.
-
-    Args:
-        request: request of an agent, shipped or in a file.
-        path: path of the file.
 
     Raises:
         ValueError: for an agent without a network of plain arrays, a file that cannot be written, or without the

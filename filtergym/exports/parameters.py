@@ -1,9 +1,8 @@
 """Parameters of an exported filter that its user sets: inputs in place of the parameters of a task and of a tuning.
 
-A filter is made and traced with expressions in place of its parameters, so that all numbers that it derives of them
-become part of the program that starts a track. A branch that depends on parameters is a condition under
-which the program holds; a parameter that becomes a plain number, or that decides a branch and nothing else, stays a
-constant.
+A filter is traced with expressions in place of its parameters, so that all numbers that it derives of them become part
+of the program that starts a track. A branch that depends on parameters is a condition under which the program holds; a
+parameter that becomes a plain number, or that decides a branch and nothing else, stays a constant.
 """
 
 import dataclasses
@@ -37,7 +36,7 @@ SUMMED = 1e-9
 
 
 class Declared(NamedTuple):
-    """A declared parameter: a number, or an array of numbers."""
+    """A declared parameter of an export: a number or an array, with its values, limits and meaning."""
 
     name: str
     shape: tuple[int, ...]
@@ -54,7 +53,7 @@ class Declared(NamedTuple):
 
 
 class Declaration(NamedTuple):
-    """The parameters of a competitor that can be set."""
+    """The parameters of an exported competitor that can be set: those of its tuning, and its task's own."""
 
     tuned: list[Declared]
     """Parameters of its tuning."""
@@ -64,19 +63,12 @@ class Declaration(NamedTuple):
 
     @property
     def all(self) -> list[Declared]:
-        """All parameters that can be set, values of the tuning first."""
+        """All parameters that can be set, those of the tuning first."""
         return [*self.tuned, *self.own]
 
 
 def declaration(task: Task, maker: Any, tunables: Mapping[str, Tunable], name: str) -> Declaration:
-    """Return the parameters of an exported competitor that its user can set.
-
-    Args:
-        task: task with the current parameters.
-        maker: maker of the competitor.
-        tunables: tunable parameters by the names of competitors.
-        name: name of the competitor.
-    """
+    """Return the parameters of an exported competitor that its user can set."""
     if isinstance(maker, TunedPolicy):
         tunable, values = maker.tunable, maker.values
     else:
@@ -100,7 +92,7 @@ def declaration(task: Task, maker: Any, tunables: Mapping[str, Tunable], name: s
 
 
 def _arguments(maker: Any) -> dict[str, Any]:
-    """Return the arguments of a competitor's maker and the fields of its prior, by name."""
+    """Return the arguments of a competitor's factory, and the fields of its argument ``prior``, by name."""
     given: dict[str, Any] = {}
     while isinstance(maker, functools.partial):
         maker, given = maker.func, {**maker.keywords, **given}
@@ -111,7 +103,7 @@ def _arguments(maker: Any) -> dict[str, Any]:
 
 
 def _untuned_value(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
-    """Return a tunable parameter's untuned value, and if that is a decimal logarithm, its argument, else None."""
+    """Return a tunable parameter's untuned value; if that is a decimal logarithm, also its argument, else None."""
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
     if isinstance(size, int | float) and not (is_log and size <= 0.0):
@@ -120,7 +112,7 @@ def _untuned_value(arguments: Mapping[str, Any], name: str, start: float) -> tup
 
 
 def _task_parameters(parameters: Any) -> Iterator[Declared]:
-    """Yield the numbers and arrays among the parameters of a task, with values, limits and meaning."""
+    """Yield the numbers and arrays among a task's parameters that are floats, with limits and meaning."""
     words = {
         name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()
     }
@@ -146,7 +138,6 @@ def _task_parameters(parameters: Any) -> Iterator[Declared]:
 
 
 def _kinds(hint: Any) -> set[Any]:
-    """Return the scalar types within a type hint, inside tuples and unions."""
     inside = typing.get_args(hint)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) in (tuple, typing.Union):
         return {kind for part in inside for kind in _kinds(part)}
@@ -154,10 +145,7 @@ def _kinds(hint: Any) -> set[Any]:
 
 
 class ParameterGraph(Graph):
-    """A graph of traced expressions in which parameters are inputs.
-
-    Args:
-        free: parameters whose numbers are the rows of ``PARAMETER``.
+    """A graph of traced expressions in which parameters of the filter are inputs.
 
     Attributes:
         conditions: conditions of the branches, and their values.
@@ -176,12 +164,12 @@ class ParameterGraph(Graph):
         self.ends: dict[int, tuple[float, float] | None] = {}
 
     def rows(self, nodes: Sequence[int]) -> set[int]:
-        """Return the rows of the parameters on which some expressions depend."""
+        """Return the rows of parameters on which some nodes of the graph depend."""
         inputs = [self.arguments[node] for node in self.live(nodes) if self.operations[node] == "input"]
         return {row for argument, row in inputs if argument == PARAMETER}
 
     def value(self, node: int) -> Any:
-        """Return the value of an expression with the default parameters; None where it depends on other inputs."""
+        """Return a node's value with the default parameters; None if it depends on other inputs."""
         if node in self.usual:
             return self.usual[node]
         for part in self.live([node]):
@@ -211,7 +199,7 @@ class ParameterGraph(Graph):
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:
-        """Return the value of an expression that Python code uses as a number; None if it needs other inputs.
+        """Return the value of a node that Python code uses as a number; None if it needs other inputs.
 
         A branch becomes a condition of the program; parameters that are used as a plain number become constant.
         """
@@ -226,7 +214,7 @@ class ParameterGraph(Graph):
         return found
 
     def is_exact(self, node: int) -> bool:
-        """Return whether an expression has the same bits on every machine: it uses exact operations alone."""
+        """Return whether a node has the same bits on every machine: it uses exact operations alone."""
         return all(self.operations[part] in EXACT for part in self.live([node]))
 
     def _is_limited(self, node: int, holds: bool) -> bool:
@@ -241,7 +229,7 @@ class ParameterGraph(Graph):
         return all(bool(OPERATIONS[name](x, y)) == holds for x in one for y in other)
 
     def _ends(self, node: int) -> tuple[float, float] | None:
-        """Return the smallest and largest value of an expression over the parameters' limits; None: unknown."""
+        """Return a node's smallest and largest value over the parameters' limits; None: unknown."""
         if node not in self.ends:
             self.ends[node] = self._ends_of_parts(node)
         return self.ends[node]
@@ -271,7 +259,7 @@ def _power(base: float, exponent: float) -> float:
 
 @contextmanager
 def traced_functions(graph: ParameterGraph) -> Iterator[None]:
-    """Make :mod:`math`'s functions accept traced numbers and return expressions, inside a ``with`` block.
+    """Let functions of :mod:`math` accept traced numbers, and return expressions, in a ``with`` block.
 
     Other arguments, and other threads, get numbers as before.
     """
@@ -309,7 +297,7 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
 
 
 def expressions(parameter: Declared, first: int, graph: Graph) -> Any:
-    """Return a parameter as nested tuples of traced inputs, whose rows begin at ``first``."""
+    """Return a parameter as nested tuples of traced inputs of a graph, from row ``first`` on."""
     nodes = [graph.input(PARAMETER, first + i) for i in range(len(parameter.values))]
 
     def nested(part: numpy.ndarray) -> Any:
@@ -321,7 +309,7 @@ def expressions(parameter: Declared, first: int, graph: Graph) -> Any:
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of a task's parameters with some values replaced, without checks and cached results."""
+    """Return a copy of a task's parameters with some values replaced, unchecked, without cached results."""
     changed = object.__new__(type(parameters))
     for field in dataclasses.fields(parameters):
         object.__setattr__(changed, field.name, values.get(field.name, getattr(parameters, field.name)))

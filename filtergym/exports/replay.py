@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class Replay(NamedTuple):
-    """Test vectors of E episodes of T measurements, and the estimates of the Python competitor."""
+    """Test vectors: initial estimates and measurements of E episodes, and the competitor's estimates in Python."""
 
     initial: numpy.ndarray
     """Initial estimate, ``(rows, E)``."""
@@ -57,7 +57,7 @@ class Replay(NamedTuple):
         return numpy.sqrt(numpy.maximum(variance, 0.0))
 
     def largest_difference(self, mean: numpy.ndarray) -> float:
-        """Return the largest difference of means ``(T, C, E)`` to the competitor's, in its standard deviations."""
+        """Return the largest difference of means ``(T, C, E)`` to the competitor's, in standard deviations."""
         with numpy.errstate(all="ignore"):
             difference = numpy.abs(mean - self.mean) / self.sigma
         same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
@@ -71,7 +71,7 @@ def _report(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return measurement, mean and covariance of an estimator by name, and ``lost``, above zero where it failed."""
+    """Return an estimator's measurement, mean and covariance by name, and ``lost``, positive where it failed."""
     return {
         **_report(model, episode),
         "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
@@ -87,12 +87,7 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
 def replay(
     request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
-    """Trace a competitor, and run it over episodes of the test split; return the traced filter and the test vectors.
-
-    Args:
-        request: competitor to trace.
-        episodes: number of episodes.
-        measurements: largest number of measurements in each.
+    """Trace a competitor, and run it over episodes of the test split; return traced filter and test vectors.
 
     Raises:
         ValueError: for a competitor that cannot be exported, or loses every episode.
@@ -127,12 +122,7 @@ def replay(
 
 
 class _Network:
-    """The network of a filter in a replay, with its memory and its last output.
-
-    Args:
-        network: network of the filter.
-        dtype: type in which it computes.
-    """
+    """The network of a filter in a replay, with its memory and its last output, computed in ``dtype``."""
 
     def __init__(self, network: "LearnedPolicy", dtype: Any) -> None:
         self.network = copy.copy(network)
@@ -143,7 +133,7 @@ class _Network:
         self.answer: Any = None
 
     def __call__(self, shown: Any) -> None:
-        """Compute and store the output, unless the first value, the flag of a decision, is zero."""
+        """Compute and store the network's output, unless the first value, the flag of a decision, is zero."""
         flag, *rest = shown
         if not numpy.all(flag):
             return
@@ -155,17 +145,9 @@ class _Network:
 
 
 def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
-    """Run a traced filter over replayed measurements, and return the rows of its estimate.
+    """Run a traced filter over replayed measurements, and return the rows of its estimate, ``(T, rows, E)``.
 
     Compiled code runs in double where code can be compiled, with the C library's functions; NumPy otherwise.
-
-    Args:
-        traced: filter to run.
-        replayed: its input.
-        dtype: type of the computation.
-
-    Returns:
-        Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64
@@ -206,12 +188,7 @@ def _interpret_update(
 
 
 class _CompiledUpdate:
-    """The update of E filters as compiled code; a call returns the rows of the results.
-
-    Args:
-        traced: the filter.
-        E: number of filters.
-    """
+    """The update of E traced filters as compiled code; a call returns the rows of the results."""
 
     def __init__(self, traced: TracedFilter, E: int) -> None:
         code, shown = traced.update, traced.shown
@@ -228,8 +205,6 @@ class _CompiledUpdate:
 
 
 class _Code:
-    """A program compiled for E lanes (parallel episodes); a call returns the rows of its results."""
-
     def __init__(self, code: StraightLineProgram, E: int) -> None:
         self.E = E
         self._inputs = sorted({step.arguments for step in code.steps if step.operation == "input"})

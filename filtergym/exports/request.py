@@ -11,7 +11,7 @@ from ..names import file_endings, find_competitor
 
 
 class ExportRequest(NamedTuple):
-    """A competitor to export, with its parameters."""
+    """A competitor to export: problem, name, factory, scenario, parameters and log."""
 
     problem: Problem
     """Problem of the competitor."""
@@ -34,9 +34,9 @@ def request_export(
     Args:
         problem: problem of the competitor.
         name: name or path, see :func:`~filtergym.names.competitor`.
-        scenario: scenario of the request.
+        scenario: scenario of the request; default: that of the log for which ``advise`` found the competitor.
         trust: whether to load files that can execute code.
-        **keywords: further fields of the request.
+        **keywords: parameters of the task.
 
     Raises:
         ValueError: for an unknown name.
@@ -57,7 +57,7 @@ def request_export(
 
 
 def _own_name(problem: Problem, name: str | Path) -> str:
-    """Return the name of an exported competitor; for a file its stem without the environment's name."""
+    """Return the name under which a competitor is exported; of a file its stem without the environment's name."""
     text = str(name)
     for ending in file_endings():
         if text.endswith(ending):

@@ -53,7 +53,7 @@ FEEDBACK = "feedback"
 
 
 class Member(NamedTuple):
-    """A number in a structure of arrays."""
+    """A number of an array in a filter's input, state or estimate: array, shape, place, meaning."""
 
     name: str
     """Name of its array: the attributes that lead to it."""
@@ -66,7 +66,7 @@ class Member(NamedTuple):
 
 
 class FreeParameters(NamedTuple):
-    """Parameters of a filter that its user sets, and the numbers that the filter derives from them at the start."""
+    """Parameters of a filter that its user sets, and the program that derives its numbers from them."""
 
     declared: Sequence[Declared] = ()
     """Arrays in the order of the rows of the argument ``PARAMETER``."""
@@ -94,7 +94,7 @@ class FreeParameters(NamedTuple):
 
 
 class TracedFilter(NamedTuple):
-    """A filter as two straight-line programs, ``start`` and ``update``."""
+    """A filter as two straight-line programs, ``start`` and ``update``, and the meaning of their rows."""
 
     start: StraightLineProgram
     """Program from the initial estimate and the parameters to the state."""
@@ -121,11 +121,8 @@ class TracedFilter(NamedTuple):
 class FilterSteps:
     """A filter's step on traced arrays, without the checks of its estimate that an evaluation makes.
 
-    Args:
-        filter: on traced arrays.
-        masked: replaces missing measurements, for a filter that never reads them.
-        decider: evaluates a network inside; None without one.
-        reports_feedback: whether it reports the quantity that steers the world, as a bank does.
+    ``masked`` replaces missing measurements, for a filter that never reads them; ``decider`` evaluates a
+    network inside.
     """
 
     def __init__(
@@ -143,7 +140,7 @@ class FilterSteps:
         )
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """Return the filter's state after a measurement, and by name mean, covariance and likelihoods."""
+        """Return the filter's state after a measurement, and numbers by name, such as mean and covariance."""
         own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
         after = own.step(state, FilterInput(received))
         records = own.records(after, received)
@@ -154,7 +151,7 @@ class FilterSteps:
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
-        """Return the expression that is true where the network is evaluated at this measurement."""
+        """Return the graph's node that is true where the network is evaluated at this measurement."""
         assert self.decider is not None
         if self.decider.interval == 1:
             return [graph.constant(True)]
@@ -179,12 +176,7 @@ def action_size(network: "LearnedPolicy") -> int:
 
 
 class NetworkPlaceholder(Policy):
-    """Placeholder of a network during the trace: stores the network's input, and returns new inputs as its output.
-
-    Args:
-        network: the replaced network.
-        graph: graph of the inputs.
-    """
+    """Policy that stands for a network in a trace: stores the network's input, returns new graph inputs."""
 
     def __init__(self, network: "LearnedPolicy", graph: Graph) -> None:
         super().__init__(network.model)
@@ -194,7 +186,7 @@ class NetworkPlaceholder(Policy):
         self.shown: list[int] = []
 
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
-        """Store the traced input, and return new inputs of the graph as action; zeros for an untraced observation."""
+        """Store the traced observation, and return new inputs of the graph as action; zeros if it is not traced."""
         if not isinstance(observation, Traced):
             return numpy.zeros(
                 (1,) if self.network.output == "argmax" else (1, action_size(self.network))
@@ -207,7 +199,7 @@ class NetworkPlaceholder(Policy):
 
 
 def check_kind(name: str, maker: Any) -> None:
-    """Raise ValueError for an object that is neither estimator nor policy."""
+    """Raise ValueError for a competitor that is neither estimator nor policy."""
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
@@ -219,15 +211,7 @@ def check_kind(name: str, maker: Any) -> None:
 def steps_of(
     traced: Task, control: str, maker: Any, plain: Model, graph: Graph
 ) -> tuple[FilterSteps, "NetworkPlaceholder | None"]:
-    """Return a competitor's step on traced arrays, and the placeholder of its network or None.
-
-    Args:
-        traced: task on traced arrays.
-        control: control of the competitor.
-        maker: maker of the competitor.
-        plain: model of the same parameters on NumPy.
-        graph: the open graph.
-    """
+    """Return a competitor's step on traced arrays, and the placeholder of its network or None."""
     if _traced_as(maker) == "learned estimator":
         policy, network = replace_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
@@ -263,7 +247,7 @@ def steps_of(
 
 
 def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder | None]:
-    """Return a policy with its network replaced by a placeholder, and the placeholder; None without a network."""
+    """Return a policy whose network a placeholder replaces, and the placeholder; None without a network."""
     if _traced_as(policy) == "network":
         asked = NetworkPlaceholder(policy, graph)
         return asked, asked
@@ -277,7 +261,6 @@ def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder 
 
 
 def _traced_as(found: Any) -> str:
-    """Return the attribute ``traced_as``: "network", "gated", "learned estimator"; empty for other objects."""
     return getattr(found, "traced_as", "")
 
 
@@ -307,12 +290,12 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
 
 
 def nodes_of(part: Any) -> list[int]:
-    """Return the graph's nodes of all numbers in nested tuples of traced arrays."""
+    """Return the graph's nodes of all numbers in nested tuples of traced arrays, in one list."""
     return [node for array in leaves(part) for node in namespace.asarray(array).nodes.ravel().tolist()]
 
 
 def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
-    """Return nested tuples of traced arrays of the form of ``part``, made of the given nodes."""
+    """Return nested tuples of traced arrays, of the form of ``part``, made of the given nodes."""
     at = iter(nodes)
 
     def leaf(array: Any) -> Traced:
@@ -339,8 +322,7 @@ class _Classes:
     """Classes of state members that are always equal or constant, found by repeated traces of the update.
 
     Members that start equal form a class, which is constant if they start constant. Where the update makes them differ,
-    the class is split, and the update is traced again. Classes that still split after some rounds, as in a window that
-    moves by one each time, are given up.
+    the class is split, and the update is traced again. Classes that still split after some rounds are given up.
     """
 
     ROUNDS = 4
@@ -354,7 +336,7 @@ class _Classes:
         self.fixed = {c: value for c, value in values.items() if value is not None}
 
     def nodes(self) -> list[int]:
-        """Return the nodes of the state's members before an update: a constant, or one input for each class."""
+        """Return the graph's nodes of the state before an update: a constant, or one input for each class."""
         return [
             self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
             for c in self.members
@@ -398,14 +380,7 @@ def trace_filter(
 ) -> TracedFilter:
     """Return a competitor as two straight-line programs, with as many free parameters as possible.
 
-    Args:
-        task: class of the environment.
-        control: control of the competitor.
-        maker: maker of the competitor.
-        name: name of the competitor, in errors.
-        plain: model of the control on NumPy, with the parameters of the export.
-        template: initial estimate and measurement, any numbers of any width.
-        tunables: tunable parameters by the names of competitors; these and the task's are free.
+    ``template`` is an initial estimate and a measurement, any numbers of any width.
 
     Raises:
         ValueError: for a competitor that is neither estimator nor policy, or no straight line of arithmetic.
@@ -447,17 +422,10 @@ def _trace_free(
     free: Sequence[Declared],
     fixed: "_Nodes | None" = None,
 ) -> "tuple[TracedFilter, _Nodes] | set[str]":
-    """Trace a competitor with some of its parameters free, or return the names of those that cannot be.
+    """Trace a competitor with some parameters free, or return the names of those that cannot be free.
 
-    Args:
-        task: class of the environment.
-        control: control of the competitor.
-        maker: maker of the competitor.
-        plain: model of the control on NumPy.
-        template: initial estimate and measurement, any numbers of any width.
-        found: all parameters.
-        free: parameters that may become inputs.
-        fixed: expressions of the filter traced without free parameters.
+    ``template`` is an initial estimate and a measurement of any width, ``fixed`` the filter traced without
+    free parameters.
     """
     graph = ParameterGraph(free)
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
@@ -561,7 +529,7 @@ SMALL = 1e-15
 
 
 class _Nodes(NamedTuple):
-    """Expressions of a filter: a graph, and the nodes of its results."""
+    """A traced filter: its graph, and the nodes of its results."""
 
     graph: ParameterGraph
     wanted: list[int]
@@ -569,7 +537,7 @@ class _Nodes(NamedTuple):
 
 
 def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
-    """Return, by node of the filter with free parameters, the constant in its place in the filter without."""
+    """Compare traces without and with free parameters; return constants of the first by node of the second."""
     one, other, found = plain.graph, free.graph, dict[int, float]()
     waiting = list(zip(plain.wanted, free.wanted, strict=True))
     seen = set(waiting)
@@ -594,14 +562,10 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
 class _Derived:
     """Largest expressions of a filter that depend on parameters alone, in the order of the rows of ``DERIVED``.
 
-    Args:
-        nodes: expressions of the filter.
-        update: results of an update, whose expressions come first.
-        start: results of the start of a track.
-        plain: expressions of the same filter traced without parameters.
+    Those of ``update`` come first; ``plain`` is the filter traced without parameters.
 
     Attributes:
-        nodes: the expressions.
+        nodes: nodes of the expressions.
         values: their values in the filter itself, with the current parameters.
         kept: number of those that the update reads.
         stated: rows whose bits a library decides, or that are computed in another order.
@@ -692,7 +656,7 @@ def _live_members(
 
 
 def _renumber_rows(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
-    """Return a program with the rows of one argument renumbered by ``place``."""
+    """Return a program in which the rows of one argument are renumbered by ``place``."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
     rows = 1 + inputs[arguments[inputs] == argument]

@@ -1,1 +1,1 @@
-"""Reproductions of papers: one folder for each paper; the installed package does not contain them."""
+"""Reproductions of papers, one folder for each; the installed package does not contain them."""

@@ -10,7 +10,7 @@ from .quantities import band
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], **keywords: Any) -> tuple[Any, Any]:
-    """Return an empty figure of ``size`` inches and its axes, ``(rows, columns)``."""
+    """Return an empty Matplotlib figure of ``size`` inches, and its axes, ``(rows, columns)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -28,7 +28,7 @@ def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def draw(axis: Any, x: numpy.ndarray, samples: numpy.ndarray, alpha: float = 0.3, **style: Any) -> None:
-    """Draw a curve over its 95 % band: its value and its bootstrap samples, ``(1 + resamples, len(x))``."""
+    """Draw a curve over its 95 % band, from its value and bootstrap samples, ``(1 + resamples, len(x))``."""
     axis.plot(x, samples[0], **style)
     if len(samples) > 1:
         axis.fill_between(x, *band(samples), color=style["color"], alpha=alpha, lw=0)
@@ -53,13 +53,13 @@ def finish(axis: Any, x: str = "", y: str = "", title: str = "", *, legend: str 
 
 
 def legend_outside(figure: Any, place: str = "lower center", columns: int = 3, handles: Any = None) -> None:
-    """Put the legend of the first axes, or of some handles, beside the panels."""
+    """Put the legend of a figure's first axes, or of some handles, beside the panels."""
     handles = figure.axes[0].get_legend_handles_labels()[0] if handles is None else handles
     figure.legend(handles=handles, loc=f"outside {place}", ncols=columns, fontsize=9, frameon=False)
 
 
 def shade(axis: Any, first: float, last: float, name: str) -> None:
-    """Shade a span of the abscissa and name it along the top."""
+    """Shade a span of the abscissa of axes, and name it along the top."""
     axis.axvspan(first, last, color="0.92", zorder=0, lw=0)
     place = {"transform": axis.get_xaxis_transform(), "ha": "center", "va": "bottom"}
     axis.text((first + last) / 2, 1.01, name, fontsize=8, color="0.35", **place)

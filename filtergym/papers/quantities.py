@@ -49,12 +49,12 @@ class Quantity(NamedTuple):
 
 
 def means(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean over runs ``(runs, ...)``, then over each bootstrap sample of them, ``(1 + resamples, ...)``."""
+    """Return the mean over runs, then over each bootstrap sample of the runs, ``(1 + resamples, ...)``."""
     return _resampling(len(values)).means(values)
 
 
 def quantity(samples: numpy.ndarray) -> Quantity:
-    """Return the value and uncertainty of a value followed by its bootstrap samples, ``(1 + resamples,)``."""
+    """Return a :class:`Quantity` from its value followed by its bootstrap samples, ``(1 + resamples,)``."""
     if len(samples) == 1:
         return Quantity(*[float(samples[0])] * 3)
     value, low, high = percentile_interval(samples).tolist()
@@ -62,7 +62,7 @@ def quantity(samples: numpy.ndarray) -> Quantity:
 
 
 def mean(values: numpy.ndarray) -> Quantity:
-    """Return the mean over the runs ``(runs,)``, with its uncertainty."""
+    """Return the mean of a number over the runs, ``(runs,)``, with its uncertainty."""
     return quantity(means(values))
 
 
@@ -75,28 +75,16 @@ def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
 def evaluate_policy(
     environment: str, name: str, scenario: str, episodes: int, **keywords: Any
 ) -> xarray.Dataset:
-    """Evaluate a policy, reference or bound on test episodes; return the dataset. One unit of work.
-
-    Args:
-        environment: Gymnasium id.
-        name: name of the policy.
-        scenario: name of the scenario.
-        episodes: Monte Carlo runs.
-        **keywords: keywords of :func:`~filtergym.evaluate`, and parameters of the task.
-    """
+    """Evaluate a policy, reference or bound on test episodes, as one unit of work; return the dataset."""
     return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 
 
 def record_run(
     task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any, Any], Mapping[str, numpy.ndarray]]
 ) -> dict[str, numpy.ndarray]:
-    """Run a policy or a reference estimator, and return quantities that an evaluation does not record.
+    """Run a policy or reference estimator, and return quantities that an evaluation does not record.
 
-    Args:
-        task: task with the actor's control.
-        actor: policy or reference estimator.
-        seeds: seed of each episode.
-        fields: function from the task and its state after a measurement to the values ``(..., N)`` to record.
+    ``fields`` maps the task and its state after a measurement to the values ``(..., N)``.
 
     Returns:
         The recorded values, ``(episodes, K, ...)`` with the other axes in reversed order.

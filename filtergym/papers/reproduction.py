@@ -1,12 +1,10 @@
 """Parts of a reproduction of a paper.
 
-A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (a table of statements,
-which :func:`judge_claims` reads, and the quantities that they rest on; tables of results), ``figures``. Its
-``__init__.py`` defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
-``reproduce(progress, episodes=None, workers=None) -> Reproduction``, which runs the experiment (``episodes`` Monte
-Carlo runs instead of its own number; units of work :func:`compute_units` from workers) and judges the claims.
-
-There is one kind of uncertainty, a bootstrap over the runs: :mod:`.quantities`. Pictures: :mod:`.panels`.
+A folder beside this file is a paper: ``experiment`` (runs and computations), ``claims`` (a table of statements, which
+:func:`judge_claims` reads, and the quantities that they rest on; tables of results), ``figures``. Its ``__init__.py``
+defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
+``reproduce(progress, episodes=None, workers=None) -> Reproduction``, where ``episodes`` replaces the paper's own number
+of Monte Carlo runs. Uncertainties: :mod:`.quantities`. Pictures: :mod:`.panels`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,7 +29,7 @@ UNCERTAINTY = (
 
 
 class Later(NamedTuple):
-    """A postponed unit of work: a function of a module and its arguments."""
+    """A postponed unit of work: a function, which must be a module's, and its arguments."""
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
@@ -44,18 +42,16 @@ def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any
 
 
 def compute_units(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
-    """Run the postponed calls inside nested containers, and return the containers with the results in their places.
+    """Return nested containers with each postponed call of :func:`later` replaced by its result.
 
-    Args:
-        results: tuples, named ones too, lists and dictionaries that contain calls from :func:`later`.
-        progress: function that is called with the number of units done.
-        workers: processes that run them; default: this process, one after the other.
+    Containers are tuples, named ones too, lists and dictionaries; ``progress`` is called with the number of
+    units done.
     """
     units: list[Later] = []
-    _places(results, units.append)
+    _replace_units(results, units.append)
     done = check_workers(workers).results(_unit, units, [1] * len(units), progress)
     found = iter(done)
-    return _places(results, lambda unit: next(found))
+    return _replace_units(results, lambda unit: next(found))
 
 
 def _unit(unit: Later, tick: Progress) -> Any:
@@ -64,22 +60,22 @@ def _unit(unit: Later, tick: Progress) -> Any:
     return found
 
 
-def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
-    """Return nested containers with ``instead(unit)`` in place of each postponed call, in their order."""
+def _replace_units(part: Any, instead: Callable[[Later], Any]) -> Any:
+    """Return nested containers with ``instead(unit)`` in place of each postponed call, in order."""
     if isinstance(part, Later):
         return instead(part)
     if isinstance(part, dict):
-        return {key: _places(value, instead) for key, value in part.items()}
+        return {key: _replace_units(value, instead) for key, value in part.items()}
     if isinstance(part, list):
-        return [_places(value, instead) for value in part]
+        return [_replace_units(value, instead) for value in part]
     if isinstance(part, tuple):
-        values = [_places(value, instead) for value in part]
+        values = [_replace_units(value, instead) for value in part]
         return type(part)(*values) if hasattr(part, "_fields") else tuple(values)
     return part
 
 
 def verdict_if(holds: bool) -> Verdict:
-    """Return the verdict on a claim of one part: "reproduced" if it holds, else "not reproduced"."""
+    """Return "reproduced" if a claim of one part holds, else "not reproduced"."""
     return "reproduced" if holds else "not reproduced"
 
 
@@ -91,7 +87,7 @@ def verdict_of(holds: Iterable[bool]) -> Verdict:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the paper, or one question that it leaves open, with verdict."""
+    """A claim of the paper, or a question that it leaves open, with measurement, method and verdict."""
 
     key: str
     statement: str
@@ -178,7 +174,7 @@ class Reproduction:
 
 
 def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
-    """Return the number of Monte Carlo runs of a reproduction, checked; ``default`` for None.
+    """Return the number of Monte Carlo runs of a reproduction; ``default`` for None.
 
     Raises:
         ValueError: for fewer than ``least``; a single run has no interval.

@@ -22,7 +22,7 @@ def reproduce(
 ) -> Reproduction:
     """Run the paper's experiment, judge its claims, and return claims, tables and figures.
 
-    A cell of the grids has at most ``GRID_EPISODES`` runs.
+    A cell of the grids of gains has at most ``GRID_EPISODES`` runs.
     """
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)

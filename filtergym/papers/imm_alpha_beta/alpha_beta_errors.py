@@ -7,7 +7,7 @@ from ...filters.array_namespace import Array
 
 
 class VarianceReduction(NamedTuple):
-    """Steady error variances per unit variance of a white measurement noise."""
+    """Steady-state error variances of an alpha-beta filter per unit variance of white measurement noise."""
 
     position: Array
     velocity: Array
@@ -31,7 +31,7 @@ def variance_reduction(alpha: Array, beta: Array) -> VarianceReduction:
 
 
 class ErrorMoments(NamedTuple):
-    """Mean and covariance of the error "truth minus estimate" of one coordinate."""
+    """Mean and covariance of the error "truth minus estimate" of one coordinate: position and velocity."""
 
     position: Array
     velocity: Array

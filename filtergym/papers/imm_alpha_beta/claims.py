@@ -36,15 +36,10 @@ SPAN = f"{SECTION[0]}-{SECTION[1]}"
 
 
 def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) -> Verdict:
-    """Return the verdict on the claim C1, "substantially smaller error on the manoeuvre section".
+    """Return the verdict on claim C1, "substantially smaller error on the manoeuvre section".
 
-    Args:
-        section: relative change over the whole section, of position and of velocity.
-        parts: relative changes over its parts (turn, recovery).
-
-    Returns:
-        "reproduced" if every change over the section lies below minus ``SUBSTANTIAL`` with its interval and
-        no part is certainly worse; "not reproduced" if no change over the section is certainly below zero.
+    "Reproduced" if every change over the section lies below minus ``SUBSTANTIAL`` with its interval and no part is
+    certainly worse; "not reproduced" if no change over the section is certainly below zero.
     """
     worse_somewhere = any(change.low > 0.0 for change in parts)
     if all(change.high < -SUBSTANTIAL for change in section) and not worse_somewhere:
@@ -74,12 +69,12 @@ class Comparison(NamedTuple):
 
 
 def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Quantity]:
-    """Return ``ours / theirs - 1`` of the RMS over a window (None: the peak), for position and velocity."""
+    """Return ``ours / theirs - 1`` of the RMS over a window (None: of the peak), for position and velocity."""
     return [quantity(change) for change in (rms(ours, window) / rms(theirs, window) - 1.0).T]
 
 
 def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
-    """Return the comparison of the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
+    """Return the IMM's RMS against an adaptive filter's on the manoeuvre section, moved by ``later`` scans."""
     windows = (SECTION, WINDOWS["turn"], WINDOWS["recovery"])
     section, turn, recovery = (
         changes(ours, theirs, (first + later, last + later)) for first, last in windows
@@ -88,7 +83,7 @@ def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0)
 
 
 def comparisons(r: Results) -> dict[str, Comparison]:
-    """Return every comparison of the IMM with an adaptive filter on the manoeuvre section, by name."""
+    """Return every comparison of the IMM with an adaptive filter, in all experiments, by name."""
     canonical = {name: r.main[name].squares for name in COMPARED_POLICIES}
     experiments: dict[str, Mapping[str, numpy.ndarray]] = {"canonical, 0.3 / 0.7": canonical}
     experiments |= {f"gains {a:g} / {b:g}": curves for (a, b), curves in r.boxed.items()}
@@ -102,7 +97,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Minimum of an error on the gain grid, and its place relative to the recommended box."""
+    """Minimum of the RMS error on the gain grid, and its place relative to the recommended box."""
 
     minimum: float
     gains: tuple[float, float]
@@ -125,14 +120,12 @@ def box_mask() -> numpy.ndarray:
 
 
 def grid_errors(grid: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """Return the RMS of a window (None: the peak) in every cell, position and velocity, ``(2, 1 + resamples, 6,
-    8)``.
-    """
+    """Return the RMS over a window (None: the peak) in every cell of the gain grid, ``(2, 1 + resamples, 6, 8)``."""
     return numpy.moveaxis(rms(grid, window), (3, 2), (0, 1))
 
 
 def grid_finding(errors: numpy.ndarray) -> GridFinding:
-    """Return the minimum of a grid of errors ``(1 + resamples, 6, 8)``, and its place relative to the box."""
+    """Return the minimum of the RMS errors ``(1 + resamples, 6, 8)`` on the gain grid, and its place."""
     inside = box_mask()
     flat = errors.reshape(len(errors), -1)
     best = flat.argmin(axis=1)
@@ -149,7 +142,7 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
 
 
 def findings(r: Results, likelihood: Likelihood, window: tuple[int, int] | None) -> list[GridFinding]:
-    """Return the minima on the gain grid, for position and for velocity."""
+    """Return the least RMS error on the gain grid, of position and of velocity, with its gains."""
     return [grid_finding(errors) for errors in grid_errors(r.grids[likelihood], window)]
 
 
@@ -166,12 +159,7 @@ def box_verdict(found: Sequence[GridFinding]) -> Verdict:
 
 
 def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
-    """Return the verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
-
-    Args:
-        straight: mean probability of mode 1 on each straight window.
-        turn: the same in the turn.
-    """
+    """Return the verdict on "mode 1 dominates on the straight legs, mode 2 in the turn"."""
     return verdict_of([mean.low > 0.5 for mean in straight] + [turn.high < 0.5])
 
 
@@ -182,7 +170,7 @@ def ramp_starts(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
     return alarms
 
 
-def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
+def rms_texts(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
     """Return position and velocity RMS of a window (None: peaks) as texts, such as ``135.68 ± 0.31``."""
     position, velocity = map(quantity, rms(squares, window).T)
     return [f"{position:.2f}", f"{velocity:.3f}"]
@@ -211,7 +199,6 @@ AGAINST = (
 
 
 def _verdict_against(i: int, quantities: Any) -> Verdict:
-    """Return the verdict on claim C1 against comparator ``i`` of ``AGAINST``."""
     comparison: Comparison = quantities.against[i]
     return comparison.verdict
 
@@ -299,7 +286,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -330,7 +317,7 @@ def quantities(r: Results) -> dict[str, Any]:
             quantity(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
             for errors in grid_errors(r.grids["gains used"], WINDOWS["all"])
         ],
-        "imm": pair(imm, WINDOWS["all"]),
+        "imm": rms_texts(imm, WINDOWS["all"]),
         "fixed": rms(r.exact["fixed gain 0.65"], WINDOWS["all"])[0],
         "quiet": _grid_text(findings(r, "gains used", WINDOWS["pre"])),
         "readings": _readings(r),
@@ -368,7 +355,9 @@ def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
     """Return a text with the RMS on both straight legs, IMM against adaptive filter."""
     straight = []
     for window in (WINDOWS["pre"], WINDOWS["post"]):
-        rows = zip(pair(imm, window), pair(adaptive, window), changes(imm, adaptive, window), strict=True)
+        rows = zip(
+            rms_texts(imm, window), rms_texts(adaptive, window), changes(imm, adaptive, window), strict=True
+        )
         parts = [
             f"{name} {ours} against {theirs} {unit} ({change:+.1%})"
             for (ours, theirs, change), (name, unit) in zip(rows, COMPONENTS, strict=True)
@@ -410,14 +399,18 @@ def _others(comparison: Mapping[str, Comparison]) -> str:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report; RMS along x, position in m / velocity in m/s."""
+    """Return the report's tables, such as the RMS along x of all algorithms, in m and m/s."""
 
     def row(name: str, squares: numpy.ndarray, later: int = 0) -> list[str]:
         last = squares.shape[1]
         moved = [(a + later, min(b + later, last)) for a, b in list(WINDOWS.values())[:-1]]
         scans = squares[0].argmax(axis=0) + 1
-        peaks = [f"{peak} @{scan}" for peak, scan in zip(pair(squares, None), scans, strict=True)]
-        return [name, *(" / ".join(pair(squares, window)) for window in (*moved, WINDOWS["all"])), *peaks]
+        peaks = [f"{peak} @{scan}" for peak, scan in zip(rms_texts(squares, None), scans, strict=True)]
+        return [
+            name,
+            *(" / ".join(rms_texts(squares, window)) for window in (*moved, WINDOWS["all"])),
+            *peaks,
+        ]
 
     spans = [f"{name} {first}-{last}" for name, (first, last) in WINDOWS.items()]
     header = ["algorithm", *spans, "peak position", "peak velocity"]
@@ -486,7 +479,7 @@ def tables(r: Results) -> list[Grid]:
             f"Whole-run RMS on the gain grid, canonical reading ({unit})",
             ["alpha_1 \\ alpha_2", *(f"{high:g}" for high in HIGH_GAINS)],
             [
-                [f"{low:g}", *(" / ".join(pair(squares, WINDOWS["all"])) for squares in cells)]
+                [f"{low:g}", *(" / ".join(rms_texts(squares, WINDOWS["all"])) for squares in cells)]
                 for low, cells in zip(LOW_GAINS, r.grids["gains used"], strict=True)
             ],
         ),

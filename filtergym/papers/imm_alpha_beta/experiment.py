@@ -1,4 +1,4 @@
-"""The paper's flight under the IMM, its rivals, the other readings of the paper, and a grid of gains."""
+"""Experiments on the paper's flight: the IMM, its rivals, other readings of the paper, a grid of gains."""
 
 import math
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ STEPS = (
 
 
 def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
-    """Return mean squares along x in each scan, ``(1 + resamples, K, 2)``, of errors ``(episodes, K, 4)``."""
+    """Return mean squares of errors ``(episodes, K, 4)`` along x in each scan, ``(1 + resamples, K, 2)``."""
     return means(error[:, :, ::2] ** 2)
 
 
@@ -76,7 +76,7 @@ def rms(squares: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray
 
 
 class Run(NamedTuple):
-    """Errors of one policy, reference or bound over all episodes."""
+    """Errors of one policy, reference or bound over all episodes, with mode probabilities and gains."""
 
     squares: numpy.ndarray
     """Mean squares, ``(1 + resamples, K, 2)``, or ``(1, K, 2)`` where they are exact."""
@@ -88,8 +88,8 @@ class Run(NamedTuple):
     """Estimate minus truth in the first episode, ``(K, 4)``."""
 
 
-def fly(name: str, episodes: int, **keywords: Any) -> Run:
-    """Run a policy, reference or bound over the paper's flight; return its errors. One unit of work."""
+def run_policy(name: str, episodes: int, **keywords: Any) -> Run:
+    """Run a policy, reference or bound over the paper's flight; return its errors, probabilities and gains."""
     one = evaluate_policy(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
     nothing = numpy.empty((0, 0))
     if "mean_square" in one:
@@ -101,14 +101,7 @@ def fly(name: str, episodes: int, **keywords: Any) -> Run:
 
 
 def record_measurements(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
-    """Return measurements and truth of test episodes of ManeuveringTarget.
-
-    Args:
-        episodes: N; the same episodes that ``evaluate`` runs.
-        seed: number of the experiment.
-        scenario: name of a scenario.
-        **keywords: parameters of the task.
-    """
+    """Return measurements and truth of test episodes of ManeuveringTarget, as ``evaluate`` runs them."""
     model = make_model(ManeuveringTarget, "gain", scenario, **keywords)
     task: Any = model.task
     starts: list[Initial] = []
@@ -130,19 +123,19 @@ def record_measurements(episodes: int, seed: int, scenario: str = "paper", **key
 
 
 def variant(recording: Recording, reading: Reading) -> numpy.ndarray:
-    """Return the mean squares of an IMM in one reading of the paper, ``(1 + resamples, K, 2)``."""
+    """Return the mean squares ``(1 + resamples, K, 2)`` of an IMM's errors in one reading of the paper."""
     return mean_squares(numpy.moveaxis(interacting_multiple_model(recording, reading), -1, 0))
 
 
 def grid_row(recording: Recording, likelihood: Likelihood, low: float) -> list[numpy.ndarray]:
-    """Return mean squares of one lower gain with every higher one, each ``(1 + resamples, K, 2)``."""
+    """Return the IMM's mean squares, each ``(1 + resamples, K, 2)``, of a lower gain with every higher one."""
     readings = [Reading(gains=(low, high), likelihood=likelihood) for high in HIGH_GAINS]
     return [variant(recording, reading) for reading in readings]
 
 
 def squares_of(name: str, episodes: int, **keywords: Any) -> numpy.ndarray:
-    """Return the mean squares of a policy over the paper's flight, ``(1 + resamples, K, 2)``. One unit of work."""
-    return fly(name, episodes, **keywords).squares
+    """Return the mean squares ``(1 + resamples, K, 2)`` of a policy's errors over the paper's flight."""
+    return run_policy(name, episodes, **keywords).squares
 
 
 class Results(NamedTuple):
@@ -187,7 +180,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     results = Results(
         episodes,
         grid_episodes,
-        main={name: later(fly, name, episodes) for name in NAMES},
+        main={name: later(run_policy, name, episodes) for name in NAMES},
         exact=exact | {"best gain schedule, flight known": exactly(schedule)},
         forced={k: exactly(ramp_schedule(low, high, scans, k)) for k in range(first, last + 1)},
         boxed={gains: rivals(gains=gains) for gains in BOX_PAIRS},

@@ -42,7 +42,7 @@ def _shade_turn(axis: Any) -> None:
 
 
 def draw_trajectory(r: Results) -> Any:
-    """Draw figure 2: the flight, with the measurements and the estimate of one episode."""
+    """Draw figure 2: the flight, with measurements and estimate of one episode."""
     figure, grid = panels(1, 2, (10.0, 4.6))
     truth, seen = r.recording.truth[:, :2, 0] / 1e3, r.recording.measurement[:, :, 0] / 1e3
     estimate = truth + r.main["imm"].first[:, :2] / 1e3
@@ -158,7 +158,7 @@ def draw_gain_grid(r: Results) -> Any:
 
 
 def _outline(axis: Any, chosen: numpy.ndarray, half: float) -> None:
-    """Draw the border of a set of cells of the gain grid."""
+    """Draw the border around a set of cells of the gain grid."""
     padded = numpy.pad(chosen, 1)
     for i, j in numpy.argwhere(chosen):
         low, high = LOW_GAINS[i], HIGH_GAINS[j]

@@ -1,8 +1,8 @@
 """Exact errors of an alpha-beta filter whose gains follow a fixed schedule.
 
-With gains that do not depend on the data the error is linear in the noise, so its mean square follows
-without Monte Carlo from :func:`.alpha_beta_errors.propagate_error`: for constant gains, for the
-ramp of the paper's adaptive filter when the scan of the detection is given, and for the best schedule.
+With gains that do not depend on the data the error is linear in the noise, so its mean square follows from
+:func:`.alpha_beta_errors.propagate_error`: for constant gains, for the ramp of the paper's adaptive filter when the
+scan of the detection is given, and for the best schedule.
 """
 
 import math
@@ -16,7 +16,7 @@ from .alpha_beta_errors import ErrorMoments, propagate_error
 
 
 class Flight(NamedTuple):
-    """The x coordinate of one flight: its manoeuvre, and the variance of its measurements."""
+    """Manoeuvre of one flight along x, scan by scan, and the variances of its measurements."""
 
     displacement: numpy.ndarray
     """Displacement by the manoeuvre in each scan, m, ``(K,)``."""
@@ -29,7 +29,7 @@ class Flight(NamedTuple):
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
-    """Return the x coordinate of the paper's flight: K scans with one manoeuvre at fixed scans."""
+    """Return the paper's manoeuvre along x, as displacement and velocity change per scan, and sensor variances."""
     p, T = parameters, parameters.sampling_interval
     first, last = p.maneuver_steps
     scans = numpy.arange(1, p.horizon + 1)
@@ -46,7 +46,7 @@ def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
 
 
 class MeanSquares(NamedTuple):
-    """Mean square of the error in each scan."""
+    """Mean square of the error of position and of velocity in each scan."""
 
     position: numpy.ndarray
     """Mean square of the position error, m^2, ``(K, ...)``."""

@@ -1,9 +1,8 @@
 """The IMM over alpha-beta filters without the environment, in several readings of the paper.
 
-The paper leaves open which covariance stands in the likelihood (11) of filters with fixed gains, and whether
-one mode variable serves both axes. The environment has the canonical reading only (the covariance that
-belongs to the gains used, mixed with the spread of the means, one mode for both axes). The others run here,
-on the measurements of the environment's own episodes, so that all of them face the same noise.
+The paper leaves open which covariance stands in the likelihood (11) of filters with fixed gains, and whether one mode
+variable serves both axes. The environment has the canonical reading only (the covariance of the gains used, mixed with
+the spread of the means, one mode for both axes). The others run here, on the measurements of its episodes.
 """
 
 from dataclasses import dataclass
@@ -38,7 +37,7 @@ Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to fill the gaps of the paper; the default is the canonical one."""
+    """One reading of the paper, where it leaves choices open; the default is the canonical one."""
 
     gains: tuple[float, ...] = (0.3, 0.7)
     stay: float = 0.9
@@ -53,13 +52,12 @@ class Reading:
 
 
 def _diagonal(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the diagonal matrices ``(d, d, ...)`` of ``(d, ...)``."""
     d = len(values)
     return numpy.eye(d).reshape(d, d, *[1] * (values.ndim - 1)) * values
 
 
 def _kalman_covariance(P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-    """Return the covariance ``(2 d, 2 d, M, N)`` after a Kalman update of a position with variances R ``(d, N)``."""
+    """Return the covariances ``(2 d, 2 d, M, N)`` after a Kalman update by positions of variances R ``(d, N)``."""
     n, modes, lanes = len(P), P.shape[2], P.shape[3]
     repeated = _diagonal(numpy.tile(R, (1, modes)))
     nothing = numpy.zeros((n, modes * lanes))

@@ -25,8 +25,8 @@ DIFFERENCES = {
 }  # fmt: skip
 
 
-def roots(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
-    """Return the root mean square errors of examples (a) and (b), by name."""
+def rms_errors(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
+    """Return the root mean square errors of example (a), and of example (b), by name."""
     a = {name: quantity(numpy.sqrt(means(r.example.squares[name]))) for name in DIFFERENCES}
     return a, {name: quantity(numpy.sqrt(squares)) for name, squares in r.squares.items()}
 
@@ -111,12 +111,12 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the measured quantities in the texts and verdicts of the claims, by name."""
-    a, b = roots(r)
+    """Return the quantities that the claims' texts and verdicts contain, by name."""
+    a, b = rms_errors(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 
     def change(name: str, other: str) -> Quantity:
-        """Return the relative change of a root mean square error to another's, paired."""
+        """Return the relative change of a root mean square error to another one, over paired episodes."""
         return quantity(numpy.sqrt(r.squares[name] / r.squares[other]) - 1.0)
 
     return {
@@ -141,8 +141,8 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report on the paper."""
-    a, b = roots(r)
+    """Return the report's tables: root mean squares measured and exact, and solutions of the Riccati equation."""
+    a, b = rms_errors(r)
     theory, exact, agreement = r.example.theory, exact_root_mean_squares(), riccati_agreement()
     return [
         Grid(

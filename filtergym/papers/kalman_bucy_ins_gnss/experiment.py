@@ -63,7 +63,7 @@ GAINS = {
 
 
 class FirstOrder(NamedTuple):
-    """Results of the runs of example (a)."""
+    """Results of example (a): paths of one run, mean squares of all runs, and exact ones."""
 
     time: numpy.ndarray
     path: Mapping[str, numpy.ndarray]
@@ -126,13 +126,13 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
 
 
 def _model() -> tuple[Any, Any, Any, Any, Any]:
-    """Return A, Q, C, R and the initial covariance of the augmented model."""
+    """Return the matrices A, Q, C, R, and the initial covariance, of example (b)'s augmented model."""
     dynamics, growth, start = ins_gnss.error_model(*LEVELS)
     return dynamics, growth, [[1.0, 0.0, 0.0]], [[PARAMETERS.receiver_intensity]], start
 
 
 def exact_plain(intensity: float, riccati: bool) -> float:
-    """Return the exact root mean square error of the plain scheme from 2.5 to 5 s, m."""
+    """Return the exact RMS error, m, of the plain scheme (INS plus filtered difference) over 2.5 to 5 s."""
     p = PARAMETERS
     dynamics, growth, _, _, P = _model()
     Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
@@ -179,7 +179,7 @@ def exact_root_mean_squares() -> dict[str, float]:
 
 
 class Agreement(NamedTuple):
-    """Largest relative differences between solutions of (5)."""
+    """Largest relative differences between solutions of the Riccati equation (5)."""
 
     hamiltonian: float
     """Exponential of the Hamiltonian matrix against the closed form, example (a)."""

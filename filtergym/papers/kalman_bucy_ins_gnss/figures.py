@@ -35,7 +35,7 @@ def _times(count: int) -> numpy.ndarray:
 
 
 def draw_first_order(r: Results) -> Any:
-    """Draw reference, process and estimate of one run, and root mean square differences over time."""
+    """Draw figure 2: one run's reference, process and estimate, and exact standard deviations over time."""
     figure, axes = panels(2, 1, (8.0, 7.2))
     time = r.example.time
     theta = kalman_bucy.moments(A, U, INTENSITY, 0, 0, time).covariance[:, 0, 0]
@@ -58,7 +58,7 @@ def draw_first_order(r: Results) -> Any:
 
 
 def draw_instruments(r: Results) -> Any:
-    """Draw the readings of INS and receiver in the example run."""
+    """Draw the positions by INS and receiver in the example run."""
     figure, axes = panels(1, 1, (8.0, 3.6))
     run = r.paths["plain-reduced"]
     time = _times(len(run["ins"]))
@@ -73,7 +73,7 @@ def draw_instruments(r: Results) -> Any:
 
 
 def draw_estimates(r: Results) -> Any:
-    """Draw the estimates of the example run, and their errors."""
+    """Draw the estimates of all policies in the example run, and their errors."""
     figure, axes = panels(2, 1, (8.0, 7.2))
     reference = r.paths["plain-reduced"]["reference"]
     time = _times(len(reference))
@@ -89,7 +89,7 @@ def draw_estimates(r: Results) -> Any:
 
 
 def draw_drift(r: Results) -> Any:
-    """Draw the mean error under a constant rate error, which the augmented scheme removes."""
+    """Draw the mean errors of all policies under a constant drift of the INS."""
     figure, axes = panels(1, 1, (8.0, 3.6))
     axis = axes[0, 0]
     for name, style in styles(list(r.drift)).items():

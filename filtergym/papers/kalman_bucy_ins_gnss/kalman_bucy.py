@@ -31,7 +31,7 @@ from ...filters.linear_systems import Matrix, intensity_matrix, square_matrix, v
 
 
 def _times(times: ArrayLike) -> Matrix:
-    """Return times as an array; raise ValueError unless they ascend from zero or later."""
+    """Return times as an array; raise ValueError unless they are not negative and ascend."""
     array = numpy.atleast_1d(numpy.asarray(times, float))
     if (
         array.ndim != 1
@@ -44,7 +44,7 @@ def _times(times: ArrayLike) -> Matrix:
 
 
 def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
-    """Return ``C^T Q^-1 C``, the information that a measurement brings in one second."""
+    """Return ``C^T Q^-1 C``, the information of a measurement in one second."""
     rows = numpy.atleast_2d(numpy.asarray(C, float))
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"C must have {size} columns, got {C!r}")
@@ -53,7 +53,7 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
 
 
 def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) -> Matrix:
-    """Return the covariance (5) of a scalar model with constant coefficients, in closed form.
+    """Return the solution of the Riccati equation (5) of a scalar model, in closed form.
 
     With ``gamma = sqrt(a^2 + w s)`` and ``u = tanh(gamma t) / gamma`` (``t`` where gamma is zero),
     ``R = (R0 (1 + a u) + w u) / (1 + (s R0 - a) u)``. It equals the usual form
@@ -93,7 +93,7 @@ def riccati_hamiltonian(
     R0: ArrayLike,
     times: ArrayLike,
 ) -> Matrix:
-    """Return the covariance (5) by the exponential of the Hamiltonian matrix, exact for constant coefficients.
+    """Return the solution of the Riccati equation (5) by the exponential of the Hamiltonian matrix.
 
     ``d/dt [P1; P2] = [[-A^T, C^T Q^-1 C], [BGB^T, A]] [P1; P2]``, ``P1(0) = I``, ``P2(0) = R0``,
     ``R = P2 P1^-1``. P1 grows without limit and its columns become parallel, so the solution is restarted.
@@ -136,7 +136,7 @@ def riccati_hamiltonian(
 def riccati_ode(
     A: ArrayLike, BGBt: ArrayLike, C: ArrayLike, Q: ArrayLike, R0: ArrayLike, times: ArrayLike
 ) -> Matrix:
-    """Return the covariance (5) by numerical integration (Runge-Kutta of order 8, relative tolerance 1e-11).
+    """Return the solution of the Riccati equation (5) by Runge-Kutta steps of order 8, to 1e-11.
 
     Arguments, result and errors as in :func:`riccati_hamiltonian`.
     """
@@ -162,7 +162,7 @@ def riccati_ode(
 
 
 class Moments(NamedTuple):
-    """Mean and covariance of the random process at given instants."""
+    """Mean and covariance of a random process at given instants."""
 
     mean: Matrix
     """Mean at each instant, ``(k, n)``."""
@@ -173,7 +173,7 @@ class Moments(NamedTuple):
 def moments(
     A: ArrayLike, U: ArrayLike, BGBt: ArrayLike, m0: ArrayLike, Theta0: ArrayLike, times: ArrayLike
 ) -> Moments:
-    """Return the mean and covariance of the process by equations (6), exact for constant coefficients and input.
+    """Return mean and covariance of a linear process by equations (6), exact for constant coefficients and input.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -206,7 +206,7 @@ def moments(
 
 
 class SampledCovariance(NamedTuple):
-    """Error covariances of a sampled filter, measurement by measurement."""
+    """Error covariances and gains of a sampled filter, measurement by measurement."""
 
     predicted: Matrix
     """Covariance before each measurement, ``(steps, n, n)``."""

@@ -1,9 +1,8 @@
 """The multi-hypothesis measurer of an inertial-satellite system (Moroz): figures 1 and 2, the claims.
 
-The paper shows two figures and prints few numbers; it gives neither the step nor any noise. Its text is read
-in two ways (see the task's module): ``increment``, scenario ``paper``, where the velocity grows while the
-accelerometers measure zero, and ``kinematic``, where they measure the acceleration. Every filter of one
-experiment faces the same noise.
+The paper gives neither the step nor any noise. Its text is read in two ways (see the task's module): ``increment``,
+scenario ``paper``, where the velocity grows while the accelerometers measure zero, and ``kinematic``, where they
+measure the acceleration. Every filter of one experiment faces the same noise.
 
 Reading: "spherical error" is the three-dimensional root-mean-square error.
 Reading: "loss of track" is not defined; here the first of ten steps in a row on which a pseudorange rate is

@@ -44,9 +44,7 @@ COORDINATE_LOSS = 0.10
 def matched_verdict(coordinates: Sequence[Quantity], others: Sequence[Quantity]) -> Verdict:
     """Return the verdict on "at most 10 % in coordinates, the other components close".
 
-    Args:
-        coordinates: ratios of the RMS position error, adaptive to matched.
-        others: ratios of other components; close is within the same 10 %.
+    The ratios are of RMS errors, adaptive to matched filter.
     """
     limit = 1.0 + COORDINATE_LOSS
     if any(r.low > limit for r in coordinates):
@@ -58,8 +56,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
     """Return the verdict on "the loss comes from the weights of the other channels".
 
     Reproduced if the loss in coordinates vanishes (less than 0.1 %) where the other channels have less than a
-    thousandth of the weight, is certain where they have most, and the settings come in the same order by
-    weight and by loss.
+    thousandth of the weight, is certain where they have most, and grows with their weight from setting to setting.
     """
     ordered = [ratios[i] for i in numpy.argsort(weights)]
     quiet = [r for w, r in zip(weights, ratios, strict=True) if w < 1e-3]
@@ -71,7 +68,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Return whether the median loss time is within the paper's."""
+    """Return whether the median time to loss of track is in the paper's band, and over 95 % of runs lose it."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
@@ -173,7 +170,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)
@@ -184,7 +181,7 @@ def quantities(r: Results) -> dict[str, Any]:
         [loss(course[name], MOTION) for course in r.courses.values()] for name in ("Singer", ADAPTIVE)
     )
     settings = {name: loss(run, SHORTEST_LEG + 1) for name, run in r.settings.items()}
-    paired = kinematic[ADAPTIVE].some(0, few)
+    paired = kinematic[ADAPTIVE].slice_runs(0, few)
     room = [
         [quantity(run.rms(c, window)) for c in range(2) for run in (adaptive, best)]
         for window in WINDOWS.values()
@@ -232,7 +229,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report on the paper."""
+    """Return the report's tables, such as spherical errors, mode probabilities, and times of loss."""
     header = [
         "filter",
         "leg",

@@ -84,7 +84,7 @@ PARTS = (
 
 
 class Run(NamedTuple):
-    """Results of one filter over E runs of K steps."""
+    """Results of one filter over E runs of K steps: squared errors, mode probabilities, NIS."""
 
     squares: numpy.ndarray
     """Squared spherical errors of position, velocity, acceleration, attitude, and squared errors of clock
@@ -101,8 +101,8 @@ class Run(NamedTuple):
     nis: numpy.ndarray
     """Normalised innovation squared over its degrees of freedom, ``(E, K)``."""
 
-    def some(self, first: int, end: int) -> "Run":
-        """Return the results of the runs ``first`` to ``end``."""
+    def slice_runs(self, first: int, end: int) -> "Run":
+        """Return the results of the runs ``first`` to ``end``, without the last."""
         return Run(*(series[first:end] for series in self))
 
     def rms(self, component: int, window: tuple[int, int]) -> numpy.ndarray:
@@ -111,17 +111,17 @@ class Run(NamedTuple):
 
     @property
     def other_weight(self) -> float:
-        """Mean probability, on Singer's motion, of the two hypotheses that are not Singer's."""
+        """Mean probability of the two wrong hypotheses where the motion is Singer's."""
         return float(1.0 - self.probability[:, MATCHED_WINDOW[0] - 1 :, SINGER].mean())
 
 
 def ratio(ours: Run, theirs: Run, component: int, window: tuple[int, int]) -> Quantity:
-    """Return the ratio of RMS errors of two filters, paired over the runs."""
+    """Return the ratio of two filters' RMS errors, paired over the runs."""
     return quantity(ours.rms(component, window) / theirs.rms(component, window))
 
 
 class _SideBySide(Policy):
-    """Several filters in one batch: the paper's probabilities in some lanes, one hypothesis in others."""
+    """Policy of lanes (parallel runs) with different filters: the paper's probabilities, or one hypothesis."""
 
     control = "weights"
 
@@ -146,10 +146,7 @@ class _SideBySide(Policy):
 def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict[str, Run]:
     """Run several filters over the same noise, and return their results by name.
 
-    Args:
-        scenario: scenario of the environment.
-        filters: names of ``FILTERS``, or "known mode", which runs alone, and how many runs each has.
-        **keywords: parameters of the task.
+    ``filters`` has the number of runs of names of ``FILTERS``, or of "known mode", which runs alone.
     """
     model = make_model(TightlyCoupledNavigation, "weights", scenario, **keywords)
     task: Any = model.task
@@ -176,7 +173,8 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     run = Run(**record_run(model, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
-        name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)
+        name: run.slice_runs(end - count, end)
+        for (name, count), end in zip(filters.items(), ends, strict=True)
     }
 
 
@@ -253,7 +251,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loss(NamedTuple):
-    """Lost tracks: their share, and times from the manoeuvre to the loss."""
+    """Share of runs that lose the track, and times from the manoeuvre to the loss, s."""
 
     rate: float
     median: float
@@ -270,7 +268,7 @@ class Loss(NamedTuple):
 
 
 def loss(run: Run, motion: int) -> Loss:
-    """Return share and times of lost tracks after the motion that begins on step ``motion``."""
+    """Return the share of runs that lose the track after a motion begins on step ``motion``, and the times."""
     outside = find_lasting(run.outside[:, motion - 1 :])
     lost = outside.any(axis=1)
     if not lost.any():
@@ -280,7 +278,7 @@ def loss(run: Run, motion: int) -> Loss:
 
 
 class Wait(NamedTuple):
-    """Seconds until the filter has adapted to a change of motion; NaN where it never adapts."""
+    """Mean, shortest and longest time, s, until a filter has adapted to a change of motion; NaN: never."""
 
     mean: float
     first: float

@@ -1,4 +1,4 @@
-"""Figures 1 and 2 of the paper, loss times, and the price of the parallel channels."""
+"""Figures 1 and 2 of the paper, times of loss of track, and the price of the parallel channels."""
 
 from typing import Any
 
@@ -115,7 +115,7 @@ def draw_loss_times(r: Results) -> Any:
 
 
 def draw_matched(r: Results) -> Any:
-    """Draw the loss against the matched filter over the mean weight of the other channels."""
+    """Draw the loss in RMS against the matched filter over the mean weight of the other channels."""
     figure, grid = panels(1, 1, (8.0, 4.4))
     axis = grid[0, 0]
     names = [name for name, _ in COMPONENTS[:3]]

@@ -42,8 +42,7 @@ def recognition_verdict(at_30: Sequence[Quantity]) -> Verdict:
 def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
     """Return the verdict on D2: the error comes within ``CLOSE`` of the ideal filter's.
 
-    Args:
-        excess: relative excess of the RMSE of each class, at 10-30 s and after 30 s.
+    ``excess`` is the relative excess of the RMSE of each class, at 10-30 s and after 30 s.
     """
     if all(abs(late.value) < CLOSE for _, late in excess):
         return "reproduced"
@@ -51,7 +50,7 @@ def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
 
 
 class Variant(NamedTuple):
-    """Result of a variant of the experiment for one class."""
+    """Recognition times and error ratios in a variant of the experiment, for targets of one class."""
 
     recognised: float
     """Median time of the first P >= 0.9, s."""
@@ -170,7 +169,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     early, middle, _ = WINDOWS.values()
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
     fighter = (printed.true_class == 2) & (printed.true_type == 1)
@@ -236,7 +235,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report on the paper."""
+    """Return the report's tables, such as RMSE by class, recognition times, and variants."""
     errors = [
         [
             f"{name} {component}, {unit}",

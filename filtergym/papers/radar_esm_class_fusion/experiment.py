@@ -1,4 +1,4 @@
-"""The paper's filter and its rivals on targets of every class, and variants of what the paper leaves open."""
+"""Experiments with the paper's filter and its rivals on targets of every class, and variants."""
 
 import math
 from typing import Any, NamedTuple
@@ -33,20 +33,20 @@ def channel_error_covariance(
     channel: int,
     start: numpy.ndarray,
 ) -> numpy.ndarray:
-    """Return the exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
+    """Return the exact error covariance ``(n, n, K + 1)`` of the filter of class c on a target of class t.
 
     Truth and error e = estimate - truth obey one linear recursion of 2 n states,
 
-        x(k) = Phi_t x + xi,   e(k) = (I - K H) (Phi_c e + (Phi_c - Phi_t) x - xi) + K v
+        x(k) = Phi_t x + xi,   e(k) = (I - K H) (Phi_c e + (Phi_c - Phi_t) x - xi) + K v,
 
-    with t the target's class and c the filter's, so the covariance follows without Monte Carlo. The mean of
-    the error is zero when that of x lies where Phi_c and Phi_t agree (any mean position and velocity).
+    so the covariance follows without Monte Carlo. The mean of the error is zero when that of x lies where Phi_c and
+    Phi_t agree (any mean position and velocity).
 
     Args:
         models: of the classes.
         channels: design of the filters, for scans 0 to K.
-        target: index of the true class.
-        channel: index of the filter.
+        target: index t of the true class.
+        channel: index c of the filter.
         start: joint covariance of (x, e) at scan 0, ``(2 n, 2 n)``.
     """
     n = models.Phi.shape[0]
@@ -67,9 +67,9 @@ def channel_error_covariance(
 
 
 def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean log-likelihood ratio of one ESM decision, nats, ``(M, M)``: row = true class.
+    """Return the mean log-likelihood ratio of one ESM decision, nats, ``(M, M)``: row = true class, column = rival.
 
-    It is the Kullback-Leibler divergence of rows of ``decision_probabilities``, which must be positive; column = rival.
+    It is the Kullback-Leibler divergence of rows of ``decision_probabilities``, which must be positive.
     """
     logarithm = numpy.log(probabilities)
     return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
@@ -99,12 +99,12 @@ STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
 
 
 def parameters(variant: str = "as in the main experiment") -> RadarEsmTrackingParameters:
-    """Return the parameters of scenario ``paper`` in a variant of the experiment."""
+    """Return the parameters of scenario ``paper``, changed as in a variant of the experiment."""
     return make_task(RadarEsmTracking, "paper", **VARIANTS[variant]).parameters
 
 
 def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int) -> numpy.ndarray:
-    """Return the exact mean square error of one class's filter on a target of another, scans 1 to K, ``(3, K)``."""
+    """Return the exact mean square error of one class's filter on another's target, scans 1 to K, ``(3, K)``."""
     models, start = RadarEsmTracking.design_models(p)
     channels = class_fusion.design_channels(models, start, p.horizon)
     joint = numpy.zeros((6, 6))
@@ -122,7 +122,7 @@ def rms(mean_square: numpy.ndarray, window: tuple[int, int]) -> float:
 
 
 class Run(NamedTuple):
-    """Records of a policy over some episodes; the argument ``of`` of its methods selects episodes."""
+    """Errors, variances and class probabilities of a policy over episodes; ``of`` selects episodes."""
 
     error: numpy.ndarray
     """Estimate minus truth, ``(episodes, K, 3)``."""
@@ -142,7 +142,7 @@ class Run(NamedTuple):
     """Mean cost over the scans, ``(episodes,)``."""
 
     def mean_square(self, component: int, window: tuple[int, int], of: Any = ...) -> numpy.ndarray:
-        """Return the mean square error of a component over a window of scans, ``(1 + resamples,)``."""
+        """Return the mean square error of a component over a window of scans, with bootstrap, ``(1 + resamples,)``."""
         return means((self.error[of][:, window[0] - 1 : window[1], component] ** 2).mean(axis=1))
 
     def true_at(self, second: float, of: Any = ...) -> Quantity:
@@ -150,7 +150,7 @@ class Run(NamedTuple):
         return mean(self.true_probability[of][:, round(second / INTERVAL) - 1])
 
     def recognition(self, share: float, of: Any = ...) -> float:
-        """Return the time, s, by which P(true class) has reached 0.9 in a share of the runs; else infinity."""
+        """Return the time, s, by which P(true class) has reached 0.9 in a share of the runs; infinite if never."""
         sure = self.true_probability[of] >= SURE
         return _quantile(numpy.where(sure.any(axis=1), sure.argmax(axis=1), math.inf), share)
 
@@ -170,7 +170,7 @@ class Run(NamedTuple):
         return mean(self.wrong()[of][:, -1].astype(float))
 
     def calibration(self, window: tuple[int, int]) -> list[Quantity]:
-        """Return mean square error over mean reported variance of each component in a window."""
+        """Return the mean square error over the mean reported variance, of each component in a window."""
         reported = self.variance[window[0] - 1 : window[1]].mean(axis=0)
         return [quantity(self.mean_square(c, window) / reported[c]) for c in range(len(COMPONENTS))]
 
@@ -180,7 +180,7 @@ def _quantile(scan: numpy.ndarray, share: float) -> float:
 
 
 def run_policy(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
-    """Run a policy over test episodes of a scenario, and return its records. One unit of work."""
+    """Run a policy over test episodes of a scenario, as one unit of work; return errors and probabilities."""
     one = evaluate_policy(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
     variance = [one[f"variance_{c.name}"].values for c in RadarEsmTracking.components]
     return Run(

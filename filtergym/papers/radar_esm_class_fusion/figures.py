@@ -61,7 +61,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_deviation(r: Results, component: int) -> Any:
-    """Draw one of figures 2 to 4: reported and actual deviation of a component on S0."""
+    """Draw one of figures 2 to 4: reported and actual standard deviation of a component on class S0."""
     from matplotlib.lines import Line2D
 
     figure, grid = panels(1, 1, (8.0, 4.2))
@@ -94,7 +94,7 @@ def draw_deviation(r: Results, component: int) -> Any:
 
 
 def draw_classes(r: Results) -> Any:
-    """Draw the actual errors of the acceleration for all three classes."""
+    """Draw the RMSE of the acceleration of three filters, on targets of each class."""
     figure, grid = panels(1, 3, (11.0, 3.8))
     for s, axis in enumerate(grid[0]):
         squares = (r.exact[s, 2][2], r.exact[s, s][2], (r.fused[s].error[:, :, 2] ** 2).mean(axis=0))

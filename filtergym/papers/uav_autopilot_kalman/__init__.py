@@ -1,8 +1,7 @@
 """Reproduction of the Kalman filter in the control loop of an unmanned aircraft (Gridnev, Rusetski, Rak).
 
-The paper prints the transition matrix, two kinds of input and the list of observed nodes; every other number
-of the experiment is ours, so its curves can be compared in kind only. What can be checked exactly is checked
-against the Lyapunov and Riccati equations.
+The paper prints the transition matrix, two kinds of input and the list of observed nodes; all other numbers are ours,
+so its curves can be compared in kind only. Where possible, checks are exact (Lyapunov and Riccati equations).
 
 Nodes: 1 the plant's input (control, command and white noise), 2 the observation z, 3 the estimate, 4 the
 innovation; all of the output coordinate. Energy spectrum: ``|DFT|^2 T / n`` averaged over runs, two-sided.

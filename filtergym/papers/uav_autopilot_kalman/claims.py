@@ -32,7 +32,7 @@ SCALES = (0.01, 1.0, 100.0)
 
 
 def _excess(datasets: dict[str, Any]) -> str:
-    """Return a text with the paper's filter's cost over that of the filter with known noise, and its ANEES."""
+    """Return a text: cost of the paper's filter over that of the filter with known noise, and its ANEES."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
     return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
@@ -130,10 +130,9 @@ CLAIMS = (
 
 
 def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
-    """Return the quantities of controllability, observability and measuring interval.
+    """Return quantities on controllability, observability and measuring interval, by name.
 
-    Args:
-        tasks: of plant P, plant U and plant P with position alone.
+    The tasks are those of plant P, plant U, and plant P with position alone.
     """
     loops = [matrices(task) for task in tasks]
 
@@ -158,7 +157,7 @@ def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     plants = ("P, H = I", "U")
     ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
     raw = [r.noise[plant]["raw-sensors"] for plant in plants]
@@ -173,7 +172,7 @@ def quantities(r: Results) -> dict[str, Any]:
     tasks = [r.noise[case]["kalman"].task for case in (*plants, "P, H = [1 0]")]
 
     def mean_ratio(values: Callable[[Any], numpy.ndarray]) -> list[float]:
-        """Return the mean without the filter over the mean with it, for both plants."""
+        """Return, for both plants, a signal's mean without the filter over its mean with the filter."""
         return [float(values(a).mean() / values(b).mean()) for a, b in zip(raw, ours, strict=True)]
 
     return {
@@ -205,7 +204,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report on the paper."""
+    """Return the report's tables, such as the variances of the loop by theory and Monte Carlo."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():

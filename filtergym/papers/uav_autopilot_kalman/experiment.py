@@ -1,4 +1,4 @@
-"""The loop of aircraft, filter and controller: its runs, and its linear theory."""
+"""Runs of the loop of aircraft, filter and controller, and its linear theory."""
 
 import math
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Signals:
         return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
 
     def variance(self, name: str) -> float:
-        """Return the mean square of a node's difference to the output, after the burn-in."""
+        """Return the mean square difference of a node's signal to the output, after the burn-in."""
         return float(numpy.mean((getattr(self, name) - self.output)[:, STEADY_WINDOW] ** 2))
 
     @property
@@ -119,12 +119,12 @@ class Results(NamedTuple):
     """Datasets of the policies of ``RANDOM`` on scenario ``random``, by plant."""
 
     def response(self, case: str) -> numpy.ndarray:
-        """Return the mean output after a unit step, ``(K - STEP_TIME + 1,)``."""
+        """Return the mean response of the output to a unit step of the command, ``(K - STEP_TIME + 1,)``."""
         # Linear loop, same noise: the difference of the runs is the response without noise, exactly.
         return (self.step[case].output - self.noise[case]["kalman"].output).mean(axis=0)[STEP_TIME - 1 :]
 
     def transient(self, case: str) -> tuple[float, float, float]:
-        """Return the overshoot, time to 90 % and time to stay within 5 %, s."""
+        """Return the step response's overshoot, time to 90 %, and time to stay within 5 %, s."""
         y, T = self.response(case), interval(self.step[case].task)
         outside = numpy.flatnonzero(numpy.abs(y - 1.0) > 0.05)
         return max(float(y.max()) - 1.0, 0.0), float(numpy.argmax(y >= 0.9)) * T, float(outside[-1] + 1) * T
@@ -191,13 +191,13 @@ def interval(task: UavAutopilot) -> float:
 
 
 def innovation_variance(task: UavAutopilot) -> float:
-    """Return the steady-state variance of the output's innovation."""
+    """Return the steady-state variance of the innovation of the controlled output."""
     d, shown = task.design, task.measured.index(task.output)
     return float((d.H @ d.steady.predicted @ d.H.T + d.R)[shown, shown])
 
 
 def spectrum(values: numpy.ndarray, T: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return frequencies, Hz, and the periodogram averaged over runs, unit squared per Hz."""
+    """Return frequencies, Hz, and the periodogram averaged over runs, unit^2/Hz, of signals ``(runs, time)``."""
     n = values.shape[1]
     power = (numpy.abs(numpy.fft.rfft(values, axis=1)) ** 2).mean(axis=0) * T / n
     return numpy.fft.rfftfreq(n, T), power
@@ -210,7 +210,7 @@ def flatness(values: numpy.ndarray) -> float:
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the theoretical power spectrum of output and nodes of the control loop under white noise, by name."""
+    """Return the theoretical power spectra of the loop's signals under white noise, by name."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
@@ -246,7 +246,7 @@ def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, nu
 
 
 def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
-    """Return the steady-state output after a unit command.
+    """Return the steady-state output of the control loop after a unit command.
 
     Args:
         task: task with the control loop.
@@ -263,7 +263,7 @@ def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
 
 
 def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
-    """Return the loop's exact cost, and variances of output and control, with the filter's process noise scaled."""
+    """Return the loop's exact cost and variances of output and control; ``scale`` is on the filter's Q."""
     F, B, H, L, _, Q, R = matrices(task)
     n, d = len(F), task.design
     K = linear_systems.steady_kalman(F, H, scale * Q, R).gain
@@ -275,7 +275,7 @@ def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
 
 
 def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
-    """Return sigma of the output's estimate and gain on the integrating mode by (12), ``(2, TWO_MINUTES)``.
+    """Return the estimate's sigma and the gain on the integrating mode by (12), ``(2, TWO_MINUTES)``.
 
     The mode's coordinate is ``w^T x`` with ``w^T F = w^T``, scaled to contain the output once.
     """
@@ -297,7 +297,7 @@ def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
 
 
 def covariance_curves(task: UavAutopilot) -> dict[str, numpy.ndarray]:
-    """Return :func:`covariances` of plant U with and without the correcting term of (12), by name of the case."""
+    """Return :func:`covariances` of plant U by (12), and in cases such as without measurements, by case."""
     names = [c.name for c in task.components]
     H = numpy.eye(len(names))
     rate, elevator = names.index("rate"), names.index("elevator")

@@ -87,7 +87,7 @@ def draw_filter(noise: Signals, step: Signals) -> Any:
 
 
 def draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) -> Any:
-    """Draw one of figures 4 to 6: one run of a node, and its spectrum with theory."""
+    """Draw one of figures 4 to 6: one run of a node's signal, and its spectrum with theory."""
     figure, axes = panels(2, 2, (9.0, 5.6), sharey="row")
     for (above, below), signals, label in zip(
         axes.T, (noise, step), ("white noise", "unit step and white noise"), strict=True
@@ -128,7 +128,7 @@ def draw_pitch_spectra(signals: Signals) -> Any:
 
 
 def draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
-    """Draw cost and variances of the loop over the process noise that its filter assumes."""
+    """Draw cost and variances of the control loop over the process noise that its filter assumes."""
     figure, axes = panels(1, len(tasks), (9.0, 3.8))
     scales = numpy.geomspace(1e-3, 1e3, 61)
     for axis, (title, task) in zip(axes[0], tasks.items(), strict=True):
@@ -158,7 +158,7 @@ def draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
 
 
 def draw_covariance(task: UavAutopilot) -> Any:
-    """Draw the covariance recursion (12) of plant U over two minutes."""
+    """Draw sigma and gain by the covariance recursion (12) of plant U over two minutes."""
     figure, axes = panels(1, 2, (9.0, 3.8))
     curves = covariance_curves(task)
     t = numpy.arange(1, TWO_MINUTES + 1) * interval(task)

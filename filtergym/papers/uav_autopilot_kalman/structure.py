@@ -36,21 +36,21 @@ def controllability_matrix(F: numpy.ndarray, B: numpy.ndarray) -> numpy.ndarray:
 
 
 def unreached_modes(F: numpy.ndarray, B: numpy.ndarray) -> numpy.ndarray:
-    """Return the eigenvalues of F outside the subspace that the control reaches."""
+    """Return the eigenvalues of F outside the subspace that the control reaches (uncontrollable modes)."""
     C = controllability_matrix(F, B)
     rest = numpy.linalg.svd(C)[0][:, numpy.linalg.matrix_rank(C) :]
     return numpy.linalg.eigvals(rest.T @ F @ rest)
 
 
 def spectral_width(task: UavAutopilot) -> float:
-    """Return the dF of the output, Hz."""
+    """Return the output's spectral width dF, Hz: the band with 99 % of its variance in the settled loop."""
     frequency = (numpy.arange(FREQUENCIES) + 0.5) / FREQUENCIES / (2.0 * interval(task))
     share = numpy.cumsum(theory_spectra(task, frequency)["output"])
     return float(frequency[numpy.argmax(share >= CONTAINED * share[-1])])
 
 
 class Approximation(NamedTuple):
-    """Root mean square error of the output at the end of one interval over its standard deviation."""
+    """RMS errors of three approximations of the output in one interval, relative to its deviation."""
 
     constant: float
     linear: float
@@ -58,7 +58,7 @@ class Approximation(NamedTuple):
 
 
 def approximation_errors(task: UavAutopilot) -> Approximation:
-    """Return the errors of the approximations of the output in one interval, in the settled loop."""
+    """Return the errors of three approximations of the output in one interval, in the settled loop."""
     loop, T = _settled_loop(task), interval(task)
     X = linear_systems.stationary_covariance(*loop)
     coordinates = numpy.eye(len(X))
@@ -66,7 +66,7 @@ def approximation_errors(task: UavAutopilot) -> Approximation:
     rate = coordinates[[c.name for c in task.components].index("rate")]
 
     def error(after: numpy.ndarray, before: numpy.ndarray) -> float:
-        """Deviation of ``after s(k+1) - before s(k)``."""
+        """Return the standard deviation of ``after s(k+1) - before s(k)``, relative to the output's."""
         carried = after @ loop.transition - before
         return float(numpy.sqrt((carried @ X @ carried + after @ loop.noise @ after) / (x @ X @ x)))
 

@@ -47,15 +47,7 @@ ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
 def advice_html(
     advice: Advice, task: Task, sentences: Sequence[str], learned: Sequence[str], settings: Settings
 ) -> str:
-    """Return the HTML report on the filter that is recommended for a recording.
-
-    Args:
-        advice: advice from :func:`~..baselines.advice.advise`.
-        task: task of the recording, with its parameters.
-        sentences: sentences that follow the first one, the verdict.
-        learned: names of shipped agents.
-        settings: command and versions.
-    """
+    """Return the HTML report on the filter that is recommended for a recording."""
     replay = advice.replay()
     return render_page(
         "advice.html.jinja",
@@ -95,12 +87,12 @@ def advice_html(
 
 
 def _drawn_names(advice: Advice) -> list[str]:
-    """Return the names of the filters that the pictures show, the advised one first."""
+    """Return the filters drawn in pictures, by name, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
-    """Yield name and text of each parameter of a fitted filter, with its interval where it was computed."""
+    """Yield each parameter of a fitted filter as name and text, with its interval if computed."""
     tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
     for key, value in found.values.items():
         interval = profiles[key].interval if key in profiles else None
@@ -124,7 +116,7 @@ def _log_lines(advice: Advice) -> Iterator[str]:
 
 
 def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[dict[str, Any]]:
-    """Yield the data that the page draws of each track of the recording, by name."""
+    """Yield for each track of the recording the data that the page draws, by name."""
     recording = advice.recording
     for episode in range(min(replay.sizes["episode"], MOST_EPISODES)):
         rows = min(int(recording.rows[episode]), replay.sizes["time"])
@@ -151,7 +143,7 @@ def _numbers(values: numpy.ndarray) -> list[float | None]:
 
 
 def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tuple[str, float, float]]:
-    """Yield label ("fitted to", "chosen by", "judged by"), first and last second of each stretch of an episode."""
+    """Yield role ("fitted to", "chosen by", "judged by"), first and last second of an episode's stretches."""
     share = advice.share
     if not share.apart:
         return
@@ -166,7 +158,7 @@ def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tup
 def _track(
     run: xarray.Dataset, task: Task, names: Sequence[str], step: int, is_outlier: numpy.ndarray
 ) -> dict[str, Any]:
-    """Return measurements, estimates, truth and outliers of a track as lists: x and y, or the main component."""
+    """Return a track's measurements, estimates, truth and outliers by name, as lists of x and y."""
     measured = measured_quantities(run.isel(policy=0), task)
     log_format = find_companion(task, LogFormat)
     if measured is None or log_format is None:
@@ -199,7 +191,7 @@ def _track(
 
 
 def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, Any]:
-    """Return the positions from the vehicle's own filter at every ``step``-th fix; empty without one."""
+    """Return the positions by the vehicle's own filter at every ``step``-th fix; empty without one."""
     if advice.onboard is None:
         return {}
     places = advice.onboard.positions[episode, :rows:step]
@@ -207,7 +199,7 @@ def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, An
 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
-    """Return the normalised innovations of a competitor, whose squares sum to the NIS."""
+    """Return a competitor's normalised innovations, at each time scaled to squares that sum to the NIS."""
     if "prediction_error" not in run or "nis" not in run:
         return {}
     groups = run["measured_group"].values
@@ -223,7 +215,7 @@ def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
 
 
 def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[str, Any]:
-    """Return the mean NIS over its dimension in windows of a recording, with time, s, and chi-square band."""
+    """Return the mean NIS per degree of freedom in windows of a track, with times, s, and chi-square band."""
     nis, degrees = (run[key].sel(policy=name).values[0] for key in ("nis", "nis_degrees"))
     there = numpy.flatnonzero(numpy.isfinite(nis) & (degrees > 0.0))
     size = max(SHORTEST_WINDOW, -(-len(there) // WINDOWS_OF_NIS))
@@ -240,7 +232,7 @@ def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[st
 
 
 def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
-    """Yield the profile likelihood of every parameter of the fitted filter, for the page's figures."""
+    """Yield the profile likelihood of each parameter of the fitted filter, as data of the page."""
     name = advice.fitted.name
     for key, profile in advice.profiles[name].items():
         plain = key.removeprefix("log10_")

@@ -30,12 +30,7 @@ def count_verdicts(findings: Sequence[Finding]) -> str:
 
 
 def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
-    """Return the crash test's table of one competitor, a line for each alteration of the measurements.
-
-    Args:
-        findings: findings of the competitor, in the order of the catalogue.
-        described: whether each line describes the alteration.
-    """
+    """Return the crash test's table of one competitor, a line for each alteration of the measurements."""
     left_out = [finding.alteration for finding in findings if finding.reason == NOT_CONTAINED]
     notes = f"Does not apply, as {NOT_CONTAINED}: {', '.join(left_out)}." if left_out else ""
     table = Table(
@@ -55,13 +50,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
 
 
 def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Return the tables of a crash test as a self-contained HTML page.
-
-    Args:
-        title: title above the tables.
-        tables: tables from :func:`crash_table`.
-        notes: sentences below them.
-    """
+    """Return the tables of a crash test, under a title and with notes, as a self-contained HTML page."""
     console = Console(width=PAGE_WIDTH, record=True, file=io.StringIO(), force_terminal=True)
     console.print(title, style="bold", markup=False, highlight=False)
     for table in tables:

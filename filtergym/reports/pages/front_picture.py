@@ -14,7 +14,7 @@ from ..tables.results import Result
 
 
 class FrontImage(NamedTuple):
-    """Cost and time of the competitors of one environment."""
+    """Picture of cost against time in one environment: title, words, and the image as a data address."""
 
     title: str
     words: str
@@ -24,11 +24,7 @@ class FrontImage(NamedTuple):
 
 
 def front_images(results: Sequence[Result]) -> list[FrontImage]:
-    """Return an image of cost against time for each environment whose competitors were timed.
-
-    Args:
-        results: results as in :func:`.headline.headline`.
-    """
+    """Return a picture of cost against time for each environment whose competitors were timed."""
     found = []
     for result, _ in headline(results):
         points = {point.name: point for point in points_of_records(result.records)}
@@ -47,7 +43,7 @@ def front_images(results: Sequence[Result]) -> list[FrontImage]:
         words = " ".join(
             f"{what}: {', '.join(map(_place, listed))}." for what, listed in lists.items() if listed
         )
-        encoded = base64.b64encode(_draw(panel, columns=1)).decode()
+        encoded = base64.b64encode(_panel_svg(panel, columns=1)).decode()
         found.append(FrontImage(title, words, f"data:image/svg+xml;base64,{encoded}"))
     return found
 
@@ -58,8 +54,8 @@ def _place(point: Point) -> str:
 
 
 @in_print
-def _draw(panel: FrontPanel, *, columns: int) -> bytes:
-    """Return a panel drawn as SVG, the same bytes every time, with text as paths."""
+def _panel_svg(panel: FrontPanel, *, columns: int) -> bytes:
+    """Draw a panel of cost against time, and return its SVG: the same bytes every time."""
     from matplotlib import rc_context
 
     # Names are of anybody: between two dollars they are no formulas.

@@ -20,13 +20,7 @@ HTML = Path(__file__).parent / "html"
 
 
 def render_page(template: str, script: str, **values: Any) -> str:
-    """Return an HTML page from a template, with its scripts and Plotly inside.
-
-    Args:
-        template: file name of the template.
-        script: file name of the page's own script.
-        **values: values of the template.
-    """
+    """Return an HTML page from a template and its ``values``, with its scripts and Plotly inside."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HTML), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )

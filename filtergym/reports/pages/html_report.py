@@ -34,7 +34,7 @@ WORDS = ("competitor", "covariance", "origin", "control")
 
 
 class Entry(NamedTuple):
-    """One cell of a table."""
+    """A cell of a table on the page: its text, and the value by which it is sorted."""
 
     text: str
     sorted_by: float | str | None = None
@@ -42,15 +42,7 @@ class Entry(NamedTuple):
 
 
 def report_html(results: Sequence[Result], settings: Settings) -> str:
-    """Return the HTML page of a report.
-
-    Args:
-        results: results of any environments and scenarios.
-        settings: command and versions.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Return the HTML page of a report on results of any environments and scenarios."""
     if not results:
         raise ValueError("there are no results to report")
     groups: dict[str, list[Result]] = {}
@@ -60,7 +52,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         {
             "id": id,
             "anchor": f"e{number}",
-            "dots": pack(_dots(group)) if len(group) > 1 else None,
+            "dots": pack(_scenario_costs(group)) if len(group) > 1 else None,
             "paper": group[0].paper,
             "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
         }
@@ -113,7 +105,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Return header and rows of a scenario's table of competitors, lowest cost first, unranked ones last."""
+    """Return header and rows of a scenario's competitors, lowest cost first, unranked ones last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
@@ -186,7 +178,7 @@ def _number(text: str) -> float | None:
 
 
 def _differences(result: Result) -> list[list[Any]]:
-    """Return rows of name, origin, and cost against the paper's algorithm with its interval, %."""
+    """Return name, origin, and cost against the paper's algorithm with interval, %, of each competitor."""
     found: dict[str, Record] = {
         r.policy: r for r in result.records if (r.metric, r.window) == (HEADLINE, "all")
     }
@@ -201,11 +193,7 @@ def _differences(result: Result) -> list[list[Any]]:
 
 
 def _front(result: Result) -> list[list[Any]]:
-    """Return rows for the picture of cost against time.
-
-    A row contains name, origin, nanoseconds, cost against the paper's algorithm in percent, whether the competitor is
-    compiled, and whether it is on the front.
-    """
+    """Return the rows of the picture of cost against time: name, origin, ns, cost in %, compiled, on the front."""
     points = points_of_records(result.records)
     on_front = front(points)
     return [
@@ -222,7 +210,7 @@ def _front(result: Result) -> list[list[Any]]:
     ]
 
 
-def _dots(group: Sequence[Result]) -> dict[str, Any]:
+def _scenario_costs(group: Sequence[Result]) -> dict[str, Any]:
     """Return the data of the picture of cost in all scenarios of an environment."""
     shown = next((result for result in group if result.default), group[0])
     return {
@@ -236,7 +224,7 @@ def _dots(group: Sequence[Result]) -> dict[str, Any]:
 
 
 def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return name, origin and colour number of each drawn competitor, equal in all scenarios of ``group``."""
+    """Return name, origin and colour number of each drawn competitor, the same in all scenarios."""
     names: dict[str, str] = {}
     for one in [*(other for other in group if other.default), *group]:
         kinds = {record.policy: record.kind for record in one.records}

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
-from ...evaluation.running.times import longest_equal, times_of_records
+from ...evaluation.running.times import METRIC, is_quicker, times_of_records
 from ..tables.ranking import find_record, ranking, rival_of
 from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE, consistency_word
@@ -17,26 +17,17 @@ HALF = (0.45, 0.55)
 
 
 def outcome_sentences(results: Sequence[Result]) -> list[str]:
-    """Return a sentence for each environment on the best competitor against the paper's algorithm, and on learned
-    against classical ones.
+    """Return a sentence for each environment on its best competitor against the paper's algorithm.
 
-    Two competitors are called level where the interval of their paired difference contains zero.
-
-    Args:
-        results: results, of which those of training distributions are used; where there is none, all.
+    Learned and classical competitors are compared, too; two are level where the interval of their paired difference
+    contains zero. Only results of training distributions are used, if there are any.
     """
     usual = [result for result in results if result.default] or list(results)
     return [sentence_of(result) for result in usual if ranking(result.records)]
 
 
 def own_sentences(records: Sequence[Record], user_names: Sequence[str], paper: str) -> list[str]:
-    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES.
-
-    Args:
-        records: records of one environment and scenario with a truth.
-        user_names: names of the user's competitors.
-        paper: name of the paper's algorithm; it may be missing in the records.
-    """
+    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES."""
     return [
         _own_sentence(records, name, paper)
         for name in user_names
@@ -77,11 +68,7 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
-    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records.
-
-    Args:
-        results: results as in :func:`outcome_sentences`.
-    """
+    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records."""
     records = [result.records[0] for result in results if result.default or not _any_default(results)]
     if not records:
         return []
@@ -121,7 +108,10 @@ def sentence_of(result: Result) -> str:
         clause += f"costs {times} times as much ({low} to {high} times)"
     else:
         clause += f"is {_percent(behind.value)} % behind it ({_range(behind.low, behind.high)})"
-    if (lead := find_lead(result.records, result.learned, origin)) is not None:
+    lead = find_lead(result.records, result.learned, origin)
+    if lead is None and find_lead(_without_spread(result.records), result.learned, origin) is not None:
+        clause += "; the times of this run are too uncertain to be compared"
+    if lead is not None:
         place = f"where a measurement may take {_times(lead)}"
         if lead.name == rival.policy:
             clause += f", and leads {place}"
@@ -153,8 +143,13 @@ def _best_clause(result: Result, best: Record) -> str:
     return f"{name} has {_percent(-found.value)} % less error cost than {paper} ({less})"
 
 
+def _without_spread(records: Sequence[Record]) -> list[Record]:
+    """Return records whose times have no interval."""
+    return [r._replace(low=None, high=None) if r.metric == METRIC else r for r in records]
+
+
 class Lead(NamedTuple):
-    """Times of a measurement for which the cheapest of one origin costs less than the cheapest of the other."""
+    """A range of times per measurement in which the cheapest of one origin costs less than the other's."""
 
     name: str
     """Name of the leader where the most time is allowed."""
@@ -165,30 +160,25 @@ class Lead(NamedTuple):
 
 
 def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:
-    """Return the times in which competitors of an origin lead, though another one has a lower cost.
+    """Return the range of times in which an origin leads, though the other one has the lowest cost.
 
     A competitor leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of
-    the other origin that takes no more time: a stricter test than that of their paired difference, which records
-    contain only against the best.
+    the other origin that may take no more time (:func:`.times.is_quicker`): a stricter test than that of their paired
+    difference, which records contain only against the best.
 
-    Args:
-        records: records of one environment and scenario.
-        learned: names of learned competitors.
-        origin: "learned" or "classical", that of the best excluded.
-
-    Returns:
-        The longest times for which they lead; None where they lead nowhere, or times are unknown.
+    The longest such range; None where ``origin`` ("learned" or "classical") leads nowhere, or times are
+    unknown.
     """
-    times = {name: time.nanoseconds for name, time in times_of_records(records).items()}
+    times = times_of_records(records)
     costs = {
         r.policy: r
         for r in records
         if (r.metric, r.window) == (HEADLINE, "all") and r.kind in RANKED and r.value is not None
     }
     known = [place.policy for place in ranking(records) if place.policy in times and place.policy in costs]
-    allowed = sorted({times[name] for name in known})
+    allowed = {times[name].nanoseconds: times[name] for name in known}
     lead: Lead | None = None
-    for first, last in itertools.pairwise([*allowed, math.inf]):
+    for first, last in itertools.pairwise([*sorted(allowed), math.inf]):
         # Names are in the order of their cost.
         mine, other = (
             next(
@@ -196,7 +186,11 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
                     name
                     for name in known
                     if ((name in learned) == (origin == "learned")) is own
-                    and times[name] <= (first if own else longest_equal(first))
+                    and (
+                        times[name].nanoseconds <= first
+                        if own
+                        else not is_quicker(allowed[first], times[name])
+                    )
                 ),
                 None,
             )

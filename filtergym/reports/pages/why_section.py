@@ -10,11 +10,7 @@ from ..tables.terminal_tables import with_interval
 
 
 def why_section(result: Result) -> list[dict[str, Any]]:
-    """Return the template's values of every competitor whose cost is split by cause, explained ones first.
-
-    Args:
-        result: result of one environment and scenario.
-    """
+    """Return the page's data on every competitor whose cost is split by cause, explained ones first."""
     names = dict.fromkeys([*result.explained, *(record.policy for record in result.records)])
     found = []
     for name in names:
@@ -63,17 +59,12 @@ def _worst_row(result: Result, one: WorstTrack) -> list[str]:
 
 
 def main_causes_in_words(one: WorstTrack, phrases: Mapping[str, str]) -> str:
-    """Return the main causes of an episode's cost in words.
-
-    Args:
-        one: the episode.
-        phrases: condition of each cause in words, by its name.
-    """
+    """Return the main causes of an episode's cost as text; ``phrases`` states each cause in words."""
     return ", ".join(phrases.get(cause, cause) for cause in one.causes) or "under no cause in particular"
 
 
 def worst_data(result: Result) -> list[dict[str, Any]]:
-    """Return the worst episodes that have a track, as values for the page's figure."""
+    """Return the worst episodes with a track, as data of the page's figure."""
     return [
         {
             "policy": one.policy,

@@ -50,12 +50,7 @@ FEWEST_MEASUREMENTS = 30
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
-    """Return a table of the advised filter, the other fitted ones, its rival and the next best filters.
-
-    Args:
-        advice: advice from :func:`~..baselines.advice.advise`.
-        learned: names of shipped agents.
-    """
+    """Return a table of the advised filter, the other fitted ones, its rival and the next best filters."""
     recording = advice.recording
     has_truth = recording.truth is not None
     judged = sum(span.last - span.first for span in advice.share.judged)
@@ -81,7 +76,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
 
 
 class Row(NamedTuple):
-    """A row of the table that compares the recommended filter with others."""
+    """A row of the table that compares the recommended filter with others: name, label, cells."""
 
     name: str
     label: str
@@ -90,7 +85,7 @@ class Row(NamedTuple):
 
 
 def advice_columns(advice: Advice) -> dict[str, int]:
-    """Return the least width of each column of the table of compared filters, by its title."""
+    """Return the titles of the columns of :func:`advice_table`, with their least widths."""
     return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 
@@ -123,7 +118,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
 
 
 def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return name and cost of an update of each filter of :func:`advice_table`; empty if none is known."""
+    """Return name and costs of an update of each filter of :func:`advice_table`; empty if none is known."""
     names = [row.name for row in advice_rows(advice, learned) if row.name != ONBOARD]
     prices = {name: advice.prices[name] for name in names}
     cells = {
@@ -183,7 +178,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
 
 
 def _extent(recording: Recording) -> Iterator[str]:
-    """Yield a sentence on the span and speeds of a log's positions, by which a user finds a wrong unit."""
+    """Yield a sentence on span and speeds of a log's positions, which reveals a wrong unit."""
     position = recording.measurements.get("position")
     if position is None:
         return
@@ -202,7 +197,7 @@ def _extent(recording: Recording) -> Iterator[str]:
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
-    """Return the advised filter's results on the measurements withheld for judgement, by name; None: unknown."""
+    """Return the advised filter's results on measurements withheld for judgement, by name; None: unknown."""
     one = advice.advised
     numbers = {
         "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
@@ -240,12 +235,7 @@ def _interval(estimate: IntervalEstimate, form: str) -> str:
 
 
 def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Yield lines on the advised filter, its parameters, their certainty, and unknown quantities.
-
-    Args:
-        advice: advice from :func:`~..baselines.advice.advise`.
-        learned: names of shipped agents.
-    """
+    """Yield the lines of a recommendation: advised filter, its parameters, certainty, and unknown quantities."""
     one = advice.fitted
     yield verdict(advice)
     if one is not advice.advised:
@@ -270,13 +260,7 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 
 def parameter_lines(tunable: Tunable, fit: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
-    """Yield a line for each fitted parameter, with unit and interval.
-
-    Args:
-        tunable: the fitted filter.
-        fit: its fit.
-        intervals: intervals of the parameters.
-    """
+    """Yield a line for each fitted parameter of a filter, with unit and interval."""
     for name, value in fit.values.items():
         text = parameter_text(name, value, intervals.get(name), tunable, name in fit.at_limit)
         line = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
@@ -284,7 +268,7 @@ def parameter_lines(tunable: Tunable, fit: Fit, intervals: Mapping[str, Interval
 
 
 def verdict(advice: Advice) -> str:
-    """Return the first sentence of a recommendation: the filter, and its error against its rival's."""
+    """Return the first sentence of a recommendation: a filter, and its error against its rival's."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
@@ -346,7 +330,7 @@ def _amount(advice: Advice, relative: IntervalEstimate) -> str:
 
 
 def _hindsight(advice: Advice) -> Iterator[str]:
-    """Yield a sentence on the shipped filter with the smallest error on the measurements withheld for judgement."""
+    """Yield a sentence on the shipped filter of least error on the measurements withheld for judgement."""
     best, relative = advice.best_shipped, advice.hindsight
     if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
         return
@@ -358,7 +342,7 @@ def _hindsight(advice: Advice) -> Iterator[str]:
 
 
 def _onboard(advice: Advice) -> Iterator[str]:
-    """Yield a sentence on the errors of the vehicle's own filter, and on the bias in its favour."""
+    """Yield a sentence on the errors of the vehicle's own filter, if the log has its estimates."""
     found = advice.onboard
     if found is None:
         return
@@ -384,7 +368,7 @@ def parameter_size(key: str, value: float) -> float:
 
 
 class ParameterText(NamedTuple):
-    """A fitted parameter in words."""
+    """A fitted parameter as texts: value, interval, unit and remark."""
 
     value: str
     interval: str
@@ -447,7 +431,7 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 
 def _likeliest(advice: Advice) -> Iterator[str]:
-    """Yield a sentence on the filter of the highest likelihood, where a cheaper one is advised."""
+    """Yield a sentence on the filter of highest likelihood, where a cheaper one is advised."""
     if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return
     name, gain = advice.likeliest
@@ -459,7 +443,7 @@ def _likeliest(advice: Advice) -> Iterator[str]:
 
 
 def _outliers(advice: Advice) -> Iterator[str]:
-    """Yield a sentence on the measurements classified as outliers, by row and time."""
+    """Yield a sentence on the share of outliers, and where they are in the log."""
     found, recording = advice.outliers, advice.recording
     count = int(found.sum())
     if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
@@ -509,7 +493,7 @@ def _noise(advice: Advice) -> Iterator[str]:
 
 
 def _anchor(advice: Advice) -> Iterator[str]:
-    """Yield a sentence on the reason for or against a filter that uses a second sensor."""
+    """Yield sentences on whether a filter that uses a second sensor helps."""
     anchor = advice.anchor
     if anchor is None:
         return
@@ -555,7 +539,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence on the learned agents, which were trained on other data."""
+    """Yield a sentence on learned agents with a larger error than the rival's."""
     found: list[JudgedFilter] = [
         c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
     ]

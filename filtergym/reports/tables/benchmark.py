@@ -53,7 +53,7 @@ cost as much as many.
 
 
 class Cell(NamedTuple):
-    """A cell of a benchmark: one environment in one scenario, with its competitors and episodes."""
+    """A cell of a benchmark: one environment in one scenario, with competitors and number of episodes."""
 
     problem: Problem
     scenario: str
@@ -85,11 +85,6 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
     Quick: the most informative ones, tuned where tuning lowers the cost and episodes are not long, and shipped agents.
     Full: every policy and estimator, untuned and tuned, shipped agents, smoothers, references, bounds.
-
-    Args:
-        problem: problem of the competitors.
-        full: whether all competitors run.
-        horizon: measurements of an episode.
     """
     known = problem.baselines
     if full:
@@ -104,19 +99,13 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
-    """Return the number of episodes, at most ``most``, that a competitor runs in some ten seconds.
-
-    Args:
-        problem: problem of the competitor.
-        scenario: scenario of the episodes.
-        most: largest number.
-    """
+    """Return the number of episodes, at most ``most``, that a competitor runs in some ten seconds."""
     seconds = problem.baselines.measurement_seconds * _horizon(problem.task, scenario)
     return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
 
 
 def drop_smoothers_of_closed_loops(problem: Problem, names: Sequence[str], scenario: Any) -> tuple[str, ...]:
-    """Return the names of competitors without the smoothers, if the scenario is a closed loop."""
+    """Return names of competitors, without smoothers if the scenario is a closed loop."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
@@ -124,7 +113,7 @@ def drop_smoothers_of_closed_loops(problem: Problem, names: Sequence[str], scena
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
-    """Return the cells (environment and scenario) of a benchmark: quick, the default scenario; full, all of them.
+    """Return the cells of a benchmark, environments times scenarios; quick: default scenarios alone.
 
     On another split than "test" only training scenarios run.
     """
@@ -157,14 +146,8 @@ def result_of(
 ) -> Result:
     """Return an evaluation as a :class:`Result`, the content of a file of results.
 
-    Args:
-        problem: the evaluated problem.
-        evaluation: an evaluation with curves, of which those of the shown competitors are stored. Its dataset needs the
-            variables of the track only, which ``drawn_episodes`` stores.
-        learned: names of learned competitors.
-        worst: worst episodes of the competitors whose cost is explained, by name; default: the paper's algorithm,
-            without episodes.
-        user_names: names of the user's own competitors.
+    The evaluation has curves, and the variables of ``drawn_episodes``. By default the cost of the paper's
+    algorithm is explained, without worst episodes.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -247,12 +230,7 @@ class Callbacks(NamedTuple):
 
 
 class _Results:
-    """Results of cells, made when the last competitor of each has finished.
-
-    Args:
-        wanted: the cells.
-        callbacks: functions that receive evaluations and results.
-    """
+    """Results of a benchmark's cells, each made when the last competitor of the cell has finished."""
 
     def __init__(self, wanted: Sequence[Cell], callbacks: Callbacks) -> None:
         self.wanted, self.callbacks = wanted, callbacks
@@ -261,7 +239,7 @@ class _Results:
         self._reported = 0
 
     def add(self, i: int, name: str, summary: Summary) -> None:
-        """Add the summary of a competitor to cell ``i``; pass results of complete cells to the callbacks, in order."""
+        """Add a competitor's summary to cell ``i``; pass results of finished cells to the callbacks, in order."""
         cell, found = self.wanted[i], self._summaries[i]
         found[name] = summary
         if len(found) == len(cell.policies):
@@ -273,7 +251,6 @@ class _Results:
             self._reported += 1
 
     def all(self) -> list[Result]:
-        """Return the results of all complete cells, in their order."""
         return [result for result in self._results if result is not None]
 
 
@@ -285,14 +262,7 @@ def run_benchmark(
 ) -> list[Result]:
     """Run a benchmark, write ``results.json``, and return the results; resume after an interruption.
 
-    Args:
-        folder: folder of ``results.json``; finished competitors are in ``unfinished/`` until all are done.
-        options: content of the benchmark.
-        callbacks: functions that are called meanwhile; default: none.
-        workers: processes that do the work; default: this process.
-
-    Returns:
-        All results.
+    Finished competitors are in ``unfinished/`` of the folder until all are done.
     """
     episode_seeds(options.split, options.seed, 1)  # refuses a split that is none before anything is written
     wanted = cells(options.full, options.environments, options.split)
@@ -337,9 +307,9 @@ def _enlarge(
 ) -> Cell:
     """Return a cell with as many episodes as the headline's intervals need, ``MOST_EPISODES`` at most.
 
-    Intermediate runs stay in the store, and the last run is not repeated. An interval's width falls with the root
-    of the number of episodes; stopping at a width keeps its coverage (Y. S. Chow and H. Robbins, On the asymptotic
-    theory of fixed-width sequential confidence intervals, Annals of Mathematical Statistics 36, 1965).
+    An interval's width falls with the root of the number of episodes; stopping at a width keeps its coverage (Y. S.
+    Chow and H. Robbins, On the asymptotic theory of fixed-width sequential confidence intervals, Annals of
+    Mathematical Statistics 36, 1965).
     """
     cell = cell._replace(episodes=max(cell.episodes, cell.problem.baselines.headline_episodes))
     while cell.episodes < MOST_EPISODES:
@@ -353,7 +323,7 @@ def _enlarge(
 
 
 def headline_half_width(result: Result) -> float:
-    """Return half the widest interval of the headline, of the best of every origin, as a share of the paper's cost."""
+    """Return half the widest interval among the best of every origin, as a share of the paper's cost."""
     shown = {name for _, name in best_of_origins(result)}
     return max(
         (

@@ -68,15 +68,7 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 
 
 def records_as_csv(path: Path, records: Sequence[Any]) -> None:
-    """Write records as a table of comma-separated values, a line each, all fields; empty where one is None.
-
-    Args:
-        path: path of the file.
-        records: named tuples of one kind.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Write named tuples of one kind as CSV, a line each, all fields; empty where one is None."""
     fields = records[0]._fields if records else Record._fields
     with whole_file(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
@@ -106,11 +98,7 @@ def _latex_character(character: str) -> str:
 def latex_table(table: Table) -> str:
     """Return a table of the terminal for LaTeX with booktabs: the same cells, its title as caption, its notes below.
 
-    Columns that are right-justified in the terminal are so here; rules separate the same sections. It spans
-    both columns of a paper if it has more than four columns, and shrinks to the available width.
-
-    Args:
-        table: table of text, or of rich's ``Text``.
+    It spans both columns of a paper if it has more than four columns, and shrinks to the available width.
     """
     environment = "table*" if len(table.columns) > 4 else "table"
     letters = "".join("r" if column.justify == "right" else "l" for column in table.columns)
@@ -155,5 +143,5 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _after_break(line: str) -> str:
-    """Return a line with ``{}`` before a bracket or asterisk, which LaTeX would read as part of a line break."""
+    """Return a line with ``{}`` before a leading bracket or asterisk, which LaTeX adds to the line break."""
     return ("{}" if line.startswith(("[", "*")) else "") + line

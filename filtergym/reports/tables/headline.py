@@ -16,8 +16,7 @@ SHORT = {"slightly overconfident": "slightly over", "slightly cautious": "slight
 def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, str, str, str]]]]:
     """Return for each environment the best competitor of every origin (paper, classical, learned ...).
 
-    Args:
-        results: results, of which those of training distributions are used; of an environment without one all.
+    Results of training distributions are used; of an environment without one all.
 
     Returns:
         Result and rows: origin, name, cost against the paper's in percent (geometric), and a word on consistency.

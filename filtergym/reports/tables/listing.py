@@ -18,7 +18,7 @@ FEWEST_COLUMNS = 20
 
 
 def _backend(cls: type[Task]) -> str:
-    """Return a text on how an environment's steps run: compiled or NumPy, and the library of exponentials."""
+    """Return a text on how an environment's steps run: compiled, with which functions, or in NumPy."""
     compiled = AVAILABLE
     if cls.id in USER_TASKS:  # those of this package can all be traced
         compiled = make_model(cls, backend="auto").backend == "compiled"
@@ -31,12 +31,7 @@ def summary_of(cls: type[Task]) -> str:
 
 
 def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[str]:
-    """Yield a line for each environment: its id and a summary.
-
-    Args:
-        tasks: tasks by id.
-        width: columns beyond which a line is continued below; None: no limit.
-    """
+    """Yield a line for each environment, its id and summary, continued below beyond ``width`` (None: no limit)."""
     longest = max(map(len, tasks), default=0)
     for id, cls in tasks.items():
         yield _hang(f"{id:<{longest}}", summary_of(cls), width)
@@ -45,11 +40,7 @@ def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[s
 def environment_lines(problem: Problem, width: int, everything: bool = False) -> Iterator[str]:
     """Yield the lines that describe an environment, at most ``width`` columns wide; the first is its id.
 
-    Args:
-        problem: the environment and its competitors.
-        width: columns.
-        everything: whether to name the parameters and describe scenarios in full; else their number, and a line for
-            each scenario.
+    With ``everything`` parameters are named and scenarios described in full, else counted and in one line.
     """
     cls, known, parameters = problem.task, problem.baselines, parameter_names(problem.task)
     yield problem.name
@@ -91,7 +82,7 @@ def _shorten(head: str, text: str, width: int) -> str:
 
 
 def _hang(head: str, text: str, width: int | None) -> str:
-    """Return a head and a text beside it, with a hanging indent."""
+    """Return a text beside its head, with a hanging indent."""
     if width is None:
         return f"{head} {text}"
     lines = textwrap.wrap(

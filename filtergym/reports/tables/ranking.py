@@ -15,21 +15,14 @@ HARM = 0.02
 def find_record(
     records: Sequence[Record], name: str, metric: str, component: str | None = None
 ) -> Record | None:
-    """Return a competitor's record of a metric over all times; of any component unless one is named.
-
-    Args:
-        records: records of one environment and scenario.
-        name: name of the competitor.
-        metric: name of the metric.
-        component: "state", or one of its components.
-    """
+    """Return a competitor's record of a metric over all times, of a component (None: any); None: no record."""
     wanted = name, metric, "all"
     found = (r for r in records if (r.policy, r.metric, r.window) == wanted)
     return next((record for record in found if component in (None, record.component)), None)
 
 
 def ranking(records: Sequence[Record]) -> list[Record]:
-    """Return the geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
+    """Return the records of the geometric mean cost of the ranked competitors of one scenario, lowest first.
 
     Competitors that are practically equal to the lowest stand in the order of the records, which is the catalogue's: a
     filter comes before its variants.
@@ -45,25 +38,16 @@ def ranking(records: Sequence[Record]) -> list[Record]:
 
 
 def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
-    """Return the best-placed competitor of the other origin, learned or classical, than the first; None: none.
-
-    Args:
-        places: ranking of at least one competitor, from :func:`ranking`.
-        learned: names of learned competitors.
-    """
+    """Return the best of the origin (learned or classical) that the first of a ranking has not; None: none."""
     was_learned = places[0].policy in learned
     return next((place for place in places if (place.policy in learned) != was_learned), None)
 
 
 def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
-    """Return which origin is best in a scenario, with the competitor's name, in two or three words.
+    """Return which origin is best in a scenario, in two or three words, such as "learned best".
 
     It rests on the paired ratio between the best one and the best of the other origin: where its interval contains one,
     no competitor is called best.
-
-    Args:
-        records: records of the scenario.
-        learned: names of learned competitors; default: the environment's shipped agents.
     """
     places = ranking(records)
     if not places:
@@ -80,13 +64,7 @@ def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = N
 
 
 def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[str] | None = None) -> str:
-    """Return a sentence on the competitor of lowest cost, its lead, and the best one of the other origin.
-
-    Args:
-        records: records of the scenario.
-        paper: name of the paper's algorithm.
-        learned: names of learned competitors; default: the environment's shipped agents.
-    """
+    """Return a sentence on the competitor of lowest cost, its lead, and the best one of the other origin."""
     places = ranking(records)
     if not places:
         return f"On `{records[0].scenario}` nothing is ranked."
@@ -125,12 +103,11 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
 
 
 def _share(share: float) -> str:
-    """Return a share of the bootstrap resamples as a percentage."""
     return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 
 def origin(result: Result, name: str, kind: str) -> str:
-    """Return the origin of a competitor: "yours", "paper", "classical", "learned" ...
+    """Return the origin of a competitor.
 
     "yours"; "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator",
     filters of its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", which
@@ -156,11 +133,7 @@ def best_of_origins(result: Result) -> list[tuple[str, str]]:
 
 
 def remarks(results: Sequence[Result]) -> list[str]:
-    """Return remarks on learned agents that do harm, and on the consistency of the best ones.
-
-    Args:
-        results: results of one or several environments.
-    """
+    """Return remarks on learned agents that do harm, and on the consistency of the best competitors."""
     sentences = []
     usual = [result for result in results if result.default] or list(results)
     winners = [(result, ranking(result.records)[:1]) for result in usual]
@@ -195,7 +168,7 @@ def remarks(results: Sequence[Result]) -> list[str]:
 
 
 def _harms(result: Result) -> list[tuple[float, str]]:
-    """Return excess cost and text of each learned agent that costs significantly more than the paper's algorithm."""
+    """Return excess cost and text of each agent that costs significantly more than the paper's algorithm."""
     return [
         (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
         for r in result.records

@@ -17,7 +17,7 @@ LEAST_EXCESS = 0.05
 
 
 class Reason(NamedTuple):
-    """The cost of a competitor under one cause."""
+    """A competitor's cost under one cause: shares of measurements and cost, ANEES, ratio to an opponent."""
 
     cause: str
     measurements: Record
@@ -37,21 +37,13 @@ class Reason(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Weight by which causes are ordered, from :func:`.evaluation.statistics.cause_split.reason_weight`."""
+        """Weight by which causes are ordered, see :func:`.evaluation.statistics.cause_split.reason_weight`."""
         shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
         return float(reason_weight(*shares))
 
 
 def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
-    """Return the cost of a competitor under each cause; the first one is the whole cost.
-
-    Args:
-        records: records of one environment and scenario.
-        name: name of the competitor.
-
-    Returns:
-        The reasons; empty where costs are not split: for bounds, and without a truth.
-    """
+    """Return the cost of a competitor under each cause, the whole cost first; empty where costs are not split."""
     found: dict[str, dict[str, Record]] = {}
     for r in records:
         if r.policy == name and r.metric.startswith(CAUSE_METRICS) and r.value is not None:
@@ -72,23 +64,13 @@ def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
 
 
 def largest_reasons(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return the causes of the largest weight whose share of the cost clearly exceeds that of the measurements.
-
-    Args:
-        reasons: reasons from :func:`reasons_of`.
-    """
+    """Return the causes of largest weight whose share of the cost clearly exceeds that of the measurements."""
     causes = [reason for reason in reasons if reason.cause != EVERYTHING and reason.excess >= LEAST_EXCESS]
     return sorted(causes, key=lambda reason: -reason.weight)[:MOST_REASONS]
 
 
 def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name: str) -> list[str]:
-    """Return short sentences on where most of a competitor's cost falls.
-
-    Args:
-        records: records of one environment and scenario.
-        phrases: when each cause holds, by name.
-        name: name of the competitor.
-    """
+    """Return short sentences on where most of a competitor's cost falls; ``phrases`` states when causes hold."""
     reasons = reasons_of(records, name)
     if not reasons:
         return []
@@ -117,11 +99,7 @@ def _times(record: Record) -> str:
 def default_explained(records: Sequence[Record], names: Sequence[str], paper: str) -> list[str]:
     """Return the name of the competitor whose cost is explained by default, in a list of at most one.
 
-    Args:
-        records: records of one environment and scenario.
-        names: names from the command line; the first ranked one is taken, else the paper's algorithm, else the
-            cheapest.
-        paper: name of the paper's algorithm.
+    The first ranked one of ``names``, those of the command line; else the paper's algorithm, else the cheapest.
     """
     ranked = [name for name, kind, _ in rank_competitors(records) if kind in RANKED]
     wanted = [name for name in [*names, paper, *ranked] if name in ranked]

@@ -29,13 +29,8 @@ def recording_tables(
 ) -> list[Table]:
     """Return tables that compare competitors by their predictions of a recording's measurements.
 
-    Args:
-        records: tidy records of one recording.
-        differences: differences of the log-likelihood per measurement to that of the best, by name, with intervals over
-            stretches of measurements.
-        has_truth: whether other tables contain errors and costs.
-        width: columns of the terminal; columns that do not fit stand below.
-        user_names: names of the user's own competitors, whose rows are marked.
+    ``differences`` are those of the log-likelihood per measurement to the best's; columns that do not fit
+    into ``width`` stand below; rows of ``user_names`` are marked.
     """
     found = {(r.policy, r.metric, r.component): r for r in records if r.window == "all"}
 
@@ -73,7 +68,7 @@ Column = Callable[[str], str]
 
 
 def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
-    """Return tables of groups of columns: as many groups side by side as fit into ``width``, the rest below."""
+    """Return tables of groups of columns: as many groups in one as fit into ``width``, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
         looks = [draw(columns, control) for control in (True, False)]

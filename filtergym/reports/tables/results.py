@@ -52,7 +52,7 @@ class Settings(NamedTuple):
 
 
 class WorstTrack(NamedTuple):
-    """An episode of high cost to a competitor, for the report."""
+    """An episode of high cost to a competitor: its opponent, seed, costs, causes and track."""
 
     policy: str
     """Name of the competitor."""
@@ -125,7 +125,7 @@ def select_competitors(
     learned: Sequence[str],
     user_names: Sequence[str] = (),
 ) -> list[str]:
-    """Return the names of the competitors whose curves a file of results contains, at most ``MOST_SHOWN``.
+    """Return the competitors whose curves a file of results contains, by name, at most ``MOST_SHOWN``.
 
     The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
@@ -153,7 +153,7 @@ def select_competitors(
 
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
-    """Return curves at most at ``MOST_TIMES`` times, and error distributions at every other share."""
+    """Return curves at ``MOST_TIMES`` times at most, and error distributions at every other share."""
     fewer = curves.isel(time=evenly_spaced(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
@@ -161,13 +161,7 @@ def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
 def track_of(
     dataset: xarray.Dataset, components: Sequence[str], plane: bool, number: int = 0
 ) -> xarray.Dataset | None:
-    """Return the truth, measurements and estimates of one episode of an evaluation.
-
-    Args:
-        dataset: dataset of an evaluation with ``drawn_episodes``; without these there is no track.
-        components: components to draw.
-        plane: whether the first two of them are the axes of a plane.
-        number: number of the episode.
+    """Return the truth, measurements and estimates of one episode of an evaluation; None: not stored.
 
     Returns:
         ``truth``, ``seen`` (measurements), ``estimate`` and its reported standard deviation ``sigma``, each (policy,
@@ -226,11 +220,7 @@ def components_to_draw(
 
 
 def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
-    """Write results to a file, completely or not at all.
-
-    Raises:
-        ValueError: if the file cannot be written.
-    """
+    """Write results to a file, completely or not at all."""
     parts = [json.dumps(_as_json(result), allow_nan=False) for result in results]
     head = json.dumps({"format": FORMAT, "settings": settings._asdict()})
     write_text(path, f'{head[:-1]}, "results": [\n' + ",\n".join(parts) + "\n]}\n")
@@ -246,12 +236,12 @@ def _as_json(result: Result) -> dict[str, Any]:
 
 
 def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
-    """Return a track in JSON's types."""
+    """Return a track as a dictionary of JSON's types."""
     return None if track is None else dataset_as_json(track, TRACK_DIGITS, DIGITS)
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Return a result's curves and track in JSON's types."""
+    """Return a result's curves and track as dictionaries of JSON's types."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),
@@ -259,14 +249,7 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Return the results in a file of :func:`write_results`, and their settings.
-
-    Args:
-        path: path of the file, or of the folder that contains it as ``results.json``.
-
-    Raises:
-        ValueError: if the file has other content.
-    """
+    """Return the results in a file of :func:`write_results`, or in ``results.json`` of a folder; and settings."""
     path = path / RESULTS if path.is_dir() else path
     try:
         values = read_json(path)
@@ -281,11 +264,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
 
 
 def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
-    """Return the results of several files in one list, and their settings.
-
-    Raises:
-        ValueError: if one cannot be read, or they contain a scenario twice.
-    """
+    """Return the results of several files in one list, and their settings."""
     read = [read_results(path) for path in paths]
     results = [result for found, _ in read for result in found]
     names = [(result.environment, result.scenario) for result in results]
@@ -338,7 +317,7 @@ def _check_dataset(part: str, found: xarray.Dataset | None) -> None:
 
 
 def check_numbers(record: Record) -> None:
-    """Raise ValueError unless value and interval of a record are finite, or None."""
+    """Raise ValueError unless the numbers of a record are finite or None, and both ends of its interval alike."""
     numbers = (record.value, record.low, record.high)
     finite = all(number is None or math.isfinite(number) for number in numbers)
     if not finite or (record.low is None) != (record.high is None):

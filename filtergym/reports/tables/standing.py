@@ -36,14 +36,9 @@ def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
 def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool = False) -> xarray.Dataset:
     """Measure agents, and the competitors they are compared with, on the episodes of a run's validations.
 
-    Args:
-        run: run that gives environment, scenario and parameters.
-        agents: file of each agent, by name.
-        trust: whether to load a model, which can execute code.
-
     Returns:
-        ``cost`` and ``anees``, normalised estimation error, of every episode, ``(policy, episode)``; ``role`` is
-        "agent", "paper", "strongest classical" or "reference".
+        ``cost`` and ``anees`` of every episode, ``(policy, episode)``; ``role`` is "agent", "paper", "strongest
+        classical" or "reference".
 
     Raises:
         ValueError: if an agent cannot be read, or needs ``trust``.
@@ -75,7 +70,7 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
 
 
 def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
-    """Return the name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
+    """Return the cheapest classical competitor but the paper's algorithm, tuned or not, by name; None without any."""
     problem, known = run.problem, run.problem.baselines
     makers = {
         name: problem.competitor(name)
@@ -95,11 +90,9 @@ def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
 
 
 def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | None]) -> Table:
-    """Return a table of agents and their opponents: cost, its difference to the paper's algorithm, consistency.
+    """Return a table of agents and their opponents: cost, difference to the paper's algorithm, consistency.
 
-    Args:
-        standing: dataset from :func:`measure_standing`.
-        passed: step at which each agent was first better than the paper's algorithm, by name.
+    ``passed`` has the step at which each agent was first better than the paper's algorithm.
     """
     bootstrap = Bootstrap(standing.sizes["episode"])
     table = plain_table(

@@ -29,11 +29,7 @@ OWN_ROW = ">"
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
     """Return a record's value and interval as text in significant digits: ``67.0 [66.6, 67.4]``.
 
-    Args:
-        record: record with ``value``, ``low`` and ``high``; or None.
-        scale: factor of all three.
-        digits: number of significant digits.
-        negligible: scaled values below this are shown as 0.
+    All three are multiplied by ``scale``; scaled values below ``negligible`` are shown as 0.
     """
     if record is None or record.value is None:
         return "-"
@@ -54,7 +50,7 @@ HEADLINE = "geometric_cost_difference"
 
 
 def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
+    """Return two cells of a table: share of lost tracks, %, and difference of mean cost to the paper's, %."""
     lost, means = (
         records.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
@@ -68,14 +64,9 @@ def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
 
 
 def consistency_word(record: Any) -> str:
-    """Return a word on a record of ANEES: "consistent" if its interval contains one, else "overconfident" or
-    "cautious".
+    """Return "consistent" if the interval of an ANEES record contains one, else "overconfident" or "cautious".
 
-    Args:
-        record: record with ``value``, ``low`` and ``high``; or None.
-
-    Returns:
-        One or two words; "slightly" marks an inconsistency of less than a factor of two.
+    "Slightly" marks an inconsistency of less than a factor of two.
     """
     if record is None or record.value is None:
         return "unknown"
@@ -105,7 +96,7 @@ def score_text(record: Any) -> str:
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Return the names of the components in a table: groups such as "position" if any, else the first three."""
+    """Return the names of the components that tables show: groups such as "position", else the first three."""
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -114,7 +105,7 @@ def main_components(records: Sequence[Any]) -> list[str]:
 
 
 def select_components(names: Sequence[str]) -> list[str]:
-    """Return those names that are groups of components, such as "position"; without any, the first three names."""
+    """Return the names that are groups of components, such as "position"; without any, the first three."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
@@ -146,13 +137,8 @@ def results_tables(
 ) -> list[Table]:
     """Return tables of all competitors, lowest cost first: cost against the paper's, consistency, score, errors.
 
-    Args:
-        records: tidy records of one environment and scenario.
-        knows: what each reference and bound knows of the truth, by its name.
-        width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
-            is cut.
-        paper: name of the paper's algorithm, with which costs are compared.
-        user_names: names of the user's own competitors, whose rows are marked.
+    Errors that do not fit into ``width`` stand below in tables of their own; rows of ``user_names`` are
+    marked.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
@@ -254,9 +240,7 @@ def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: 
 def _tables_below_each_other(
     draw: Callable[..., Table], costs: Columns, errors: Columns, width: int
 ) -> list[Table]:
-    """Return the costs in one table and the errors below, each in a table of its own where they do not fit side by
-    side.
-    """
+    """Return a table of costs, and below it the errors, side by side if they fit, else a table each."""
     costs, errors = dict(costs), dict(errors)
     table = first_fitting([draw(costs, False, compact) for compact in (False, True)], width)
     if table is None:
@@ -274,7 +258,7 @@ def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
 
 
 def plain_table(title: str | None = None) -> Table:
-    """Return an empty table in the common form: one line below the head, two spaces between columns."""
+    """Return an empty table in the style of all tables: one line below the head, two spaces between columns."""
     return Table(
         title=title,
         title_justify="left",
@@ -293,7 +277,7 @@ def competitors_table(
     compact: bool = False,
     user_names: Collection[str] = (),
 ) -> Table:
-    """Return a table of the competitors, with unranked ones in sections of their own, and marks on the user's rows."""
+    """Return a table with a row for each competitor, unranked ones in sections of their own, the user's marked."""
     table = plain_table()
     table.add_column("policy", overflow="fold")
     if control:
@@ -334,18 +318,13 @@ def flights_table(
 ) -> Table:
     """Return a table with a row for each flight: RMSE of the paper's algorithm, and others' cost against it.
 
-    Args:
-        dataset: dataset of an evaluation of flights.
-        records: records of every flight.
-        over_all: records over all flights, which rank the competitors.
-        width: columns of the terminal; as many of the best competitors are shown as fit.
+    As many of the best competitors are shown as fit into ``width``.
     """
     tables = [_flights(dataset, records, over_all, shown) for shown in range(SHOWN_OF_FLIGHTS, 0, -1)]
     return first_fitting(tables, width) or tables[0]
 
 
 def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
-    """Return the table of flights with at most ``most`` competitors beside the paper's algorithm."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]

@@ -24,14 +24,7 @@ def find_worst(
     competitors: Sequence[Competitor],
     explained: Sequence[str],
 ) -> dict[str, list[WorstTrack]]:
-    """Run the worst episodes of some competitors again with their opponents; return the tracks by competitor.
-
-    Args:
-        experiment: experiment of the evaluation.
-        evaluation: evaluation of the competitors.
-        competitors: competitors of the evaluation.
-        explained: names of the competitors whose episodes are run.
-    """
+    """Run the worst episodes of the competitors in ``explained`` again, with their opponents; return the tracks."""
     found: dict[str, list[WorstTrack]] = {name: [] for name in explained}
     for name in found.keys() & evaluation.costs.keys():
         opponent = find_opponent(evaluation.records, name)
@@ -62,7 +55,7 @@ def _label(dataset: xarray.Dataset, number: int) -> str:
 
 
 def find_opponent(records: Sequence[Record], name: str) -> str:
-    """Return the name of the opponent to whose cost a competitor's is compared; empty: none."""
+    """Return the name of the opponent with whose cost a competitor's is compared by cause; empty: none."""
     ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
     return ratios[0] if ratios else ""
 
@@ -70,13 +63,7 @@ def find_opponent(records: Sequence[Record], name: str) -> str:
 def worst_figures(
     worst: Mapping[str, Sequence[WorstTrack]], phrases: Mapping[str, str], columns: int
 ) -> Iterator[tuple[str, Any]]:
-    """Draw the worst episodes of each competitor; yield the name of a file, and the figure.
-
-    Args:
-        worst: episodes from :func:`find_worst`.
-        phrases: when each cause holds, by name.
-        columns: width of the figures in columns of a paper, 1 or 2.
-    """
+    """Draw the worst episodes of each competitor; yield the name of a file, and the figure."""
     for name, episodes in worst.items():
         own = [(one, one.track) for one in episodes if one.track is not None]
         titles = [_titles(one, phrases) for one, _ in own]
