@@ -278,7 +278,7 @@ def print_times(found: dict[tuple[str, ...], Any]) -> None:
     )
     for lanes in SIZES:
         row = found.get(("time", lanes), [])
-        print(f"| {lanes} at once | " + " | ".join(f"{one:.0f}" for one in row) + " |")
+        print(f"| {lanes} at once | " + " | ".join(f"{one:.1f}" for one in row) + " |")
 
 
 def cells(stages: list[str], only: list[str], seeds: int) -> Iterator[tuple[str, ...]]:

@@ -6,10 +6,11 @@ next one reads. So there are two lists, for even and odd steps. Some entries of 
 A tile of lanes passes through all steps before the next tile begins, so that it stays in the processor's cache.
 """
 
+import ctypes
 import functools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy
@@ -272,6 +273,19 @@ class CallSequence:
         if trial:
             self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
             self._tries += 1
+
+    def call(self, width: int) -> Callable[[], None]:
+        """Return a call without arguments that runs all steps over all lanes, in half the time of :meth:`run`.
+
+        The caller keeps the sequence, and calls :meth:`expect` before the first run and once in a while.
+        """
+        driver: Callable[..., None] = _driver()
+        address, first, last = (
+            ctypes.c_void_p(address_of(self._given)),
+            ctypes.c_int64(0),
+            ctypes.c_int64(width),
+        )
+        return functools.partial(driver, address, first, last)
 
     def count_with(self, other: "CallSequence") -> None:
         """Share the count of lanes with another sequence of the same code on other memory."""

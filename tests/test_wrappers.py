@@ -100,6 +100,86 @@ def test_estimates_are_those_of_a_naive_filter():
         np.testing.assert_allclose(found.innovation[0, 0], innovation, atol=1e-12)
 
 
+@pytest.mark.parametrize("control", [None, "gain"])
+def test_numpy_has_the_numbers_of_the_compiled_step(control, monkeypatch):
+    envs = [wrapped("Pendulum-v1", FAULTS, show=ALL, control=control)]
+    for module in ("readings", "recursions"):
+        monkeypatch.setattr(f"filtergym.wrappers.{module}.AVAILABLE", False)
+    envs.append(wrapped("Pendulum-v1", FAULTS, show=ALL, control=control))
+    envs[0].action_space.seed(0)
+    for seed in (3, 4):
+        assert len({env.reset(seed=seed)[0].tobytes() for env in envs}) == 1
+        for _ in range(70):
+            action = envs[0].action_space.sample()
+            infos = [env.step(action)[-1] for env in envs]
+            np.testing.assert_array_equal(infos[0]["available"], infos[1]["available"])
+            # Sine, cosine and arctangent of the libraries differ in the last place.
+            np.testing.assert_allclose(*(env.env.reading.values for env in envs), rtol=1e-14, atol=1e-14)
+            for one, other in zip(*(env.estimates for env in envs), strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)
+
+
+def test_filters_of_the_same_sensors_and_of_several_steps():
+    class TwoSteps(gymnasium.Wrapper):
+        def step(self, action):
+            self.env.step(action)
+            return self.env.step(action)
+
+    sensors = pendulum()
+    both = [EstimatedObservation(sensors, competitor=one, show="mean") for one in ("unscented", "extended")]
+    alone = wrapped("Pendulum-v1", ENCODER, show="mean")
+    skipping = EstimatedObservation(TwoSteps(pendulum()), show="mean")
+    for env in (both[1], alone, skipping):
+        env.reset(seed=1)
+    for _ in range(20):
+        found = [both[1].step([1.0])[0] for _ in range(2)][-1]
+        np.testing.assert_array_equal([alone.step([1.0])[0] for _ in range(2)][-1], found)
+        np.testing.assert_array_equal(skipping.step([1.0])[0], found)
+    assert (both[0].estimates.mean != both[1].estimates.mean).any()
+
+
+class AverageReading:
+    """An estimator in Python: the mean of all readings of an episode."""
+
+    def __init__(self, task):
+        self.size = len(task.components)
+
+    def start(self, initial, N):
+        return np.zeros((2, N))
+
+    def update(self, memory, measurement):
+        memory = memory + np.stack([measurement.values[0], np.ones(memory.shape[1])])
+        mean = np.zeros((self.size, memory.shape[1]))
+        mean[0] = memory[0] / memory[1]
+        return mean, np.repeat(np.eye(self.size)[:, :, None], memory.shape[1], axis=2), memory
+
+
+def test_an_estimator_in_python_begins_anew_with_every_episode():
+    env = wrapped("MountainCarContinuous-v0", competitor=AverageReading, show="mean")
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        readings = [env.env.reading.values[0, 0]]
+        for _ in range(5):
+            found = env.step([1.0])[0]
+            readings.append(env.env.reading.values[0, 0])
+            assert found[0] == pytest.approx(np.mean(readings), abs=1e-7)
+
+
+def test_a_model_without_inputs_under_any_action():
+    env = gymnasium.make("MountainCar-v0")
+    env.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,))
+    env = gymnasium.wrappers.TransformAction(env, lambda action: 1, env.action_space)
+    model = EnvironmentModel(
+        names=("p", "v"), f=lambda x, dt: [x[0] + x[1], x[1]], interval=1.0, noise=(1e-6, 1e-6),
+        mean=(-0.5, 0.0), covariance=(0.01, 1e-4),
+    )  # fmt: skip
+    env = EstimatedObservation(NoisyObservation(env, {"p": {"h": "p", "R": 1e-4}}, model), show="mean")
+    env.reset(seed=0)
+    for _ in range(20):
+        found = env.step(np.zeros(3, dtype=np.float32))[0]
+    assert found[0] == pytest.approx(env.unwrapped.state[0], abs=0.03)
+
+
 def test_a_delay_is_bridged_by_the_motion():
     """The filter of late readings is that of readings in time, as many steps before, carried forward."""
     late, model = {"encoder": {**ENCODER["encoder"], "delay": 3}}, CLASSIC_CONTROL["Pendulum"]
@@ -172,10 +252,13 @@ def readings_of(sensors, steps, model=None, name="Pendulum-v1", lanes=200):
     env = vector.NoisyObservation(
         gymnasium.make_vec(name, num_envs=lanes, vectorization_mode="sync"), sensors
     )
-    readings, n = env._readings, len(env.model.names)
-    every, state = np.ones(lanes, dtype=bool), np.full((lanes, n), 0.3)
-    found = [readings.begin(every, state, list(range(lanes)))]
-    found += [readings.advance(None, state) for _ in range(steps - 1)]
+    every, state = np.ones(lanes, dtype=bool), np.full((lanes, len(env.model.names)), 0.3)
+    observation = state if env.model.observation is None else env.model.observation(state)
+    env._read(observation, every, ~every, list(range(lanes)))
+    found = [env.reading]
+    for _ in range(steps - 1):
+        env._read(observation)
+        found.append(env.reading)
     return tuple(np.array(part) for part in zip(*found, strict=True))
 
 
@@ -453,6 +536,13 @@ def pendulum(**sensor):
         (lambda: EstimatedObservation(pendulum(), competitor="ekf"), "one of extended, unscented"),
         (lambda: EstimatedObservation(pendulum(), show="truth"), "show must be"),
         (lambda: EstimatedObservation(pendulum(), control="evidence"), "noise or gain"),
+        (
+            lambda: vector.EstimatedObservation(
+                vector.NoisyObservation(gymnasium.make_vec("Pendulum-v1", 2, "sync"), ENCODER),
+                competitor=AverageReading,
+            ),
+            "wrap each environment",
+        ),
         (lambda: discrete(), "a function from actions to these inputs"),
         (lambda: discrete(lambda action: np.zeros((len(action), 2))), "must return the 1 inputs force"),
         (

@@ -23,8 +23,8 @@ __all__ = [
     "NoisyObservation",
     "fit_model",
 ]
-ONE = numpy.ones(1, dtype=bool)
-"""The lane of a single environment."""
+ONE, NONE = numpy.ones(1, dtype=bool), numpy.zeros(1, dtype=bool)
+"""Whether the lane of a single environment begins an episode, and whether it goes on, in a reset."""
 
 
 class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -51,16 +51,17 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin an episode of the environment, and its readings."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self.events = []
-        (values,) = self._begin(ONE, [observation], [seed])
-        return values, {**info, "available": self.reading.available[0].copy()}
+        values, info["available"] = self._read(observation, ONE, NONE, [seed])
+        return values, info
 
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and read the sensors."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        values = self._advance(None, numpy.asarray(observation)[None])[0]
-        info = {**info, "available": self.reading.available[0].copy()}
-        return values, reward, terminated, truncated, info
+        own = self._readings
+        own.place[...] = observation
+        own.run()
+        info["available"] = own.available.astype(bool) if own.always is None else own.always.copy()
+        return own.values.astype(self._dtype), reward, terminated, truncated, info
 
 
 class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -81,18 +82,3 @@ class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     Raises:
         ValueError: where no sensors are below, or the model does not fit.
     """
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin an episode, and the filter with its first readings."""
-        _, info = self.env.reset(seed=seed, options=options)
-        self._take(None, None)
-        return self._shown()[0], info
-
-    def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and take its readings in."""
-        action, own = self._split(action)
-        _, reward, terminated, truncated, info = self.env.step(action)
-        self._take(numpy.asarray(action)[None], None if own is None else own[None])
-        return self._shown()[0], reward, terminated, truncated, info

@@ -1,30 +1,31 @@
 """A filter of a state-space model behind the sensors of an environment, for many lanes."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-import gymnasium
 import numpy
 
 from ..baselines.problem import Problem
 from ..baselines.state_space import state_space_baselines
-from ..compiler.functions import round_up_lanes
-from ..envs.contract.filter import Initial
+from ..compiler.functions import map_arrays
+from ..envs.contract.filter import FilterInput, Initial
 from ..envs.data.recorded_world import Feed
 from ..envs.engine.backend import make_model
-from ..envs.engine.compiled import can_step
+from ..envs.engine.compiled import CompiledModel
 from ..envs.engine.scenario_choice import find_scenario
-from ..envs.linear.equations import StateSpaceMeasurement
+from ..envs.linear.equations import Passage, StateSpaceMeasurement
 from ..envs.linear.inputs import Input
 from ..envs.linear.sensors import Sensor
 from ..evaluation.competitors.filters import close_loop
 from ..evaluation.competitors.kinds import kind_of
-from ..evaluation.competitors.stepping import CompiledUpdate, ModelUpdate
+from ..filters.angles import shorten
 from ..filters.array_namespace import select_nested
 from ..own_models import state_space
 from .models import EnvironmentModel
-from .readings import Array, EnvironmentSensor, Reading
+from .readings import EnvironmentSensor, Readings
+from .recursions import Array, Recursion
 
 PARTS = ("observation", "mean", "deviation", "nis", "innovation")
 """What an observation may hold of an estimate."""
@@ -37,14 +38,11 @@ _PROBLEMS: dict[tuple[Any, ...], tuple[Problem, Any]] = {}
 
 
 def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSensor]) -> Problem:
-    """Return the estimation problem of a model and sensors, which is defined once.
-
-    Raises:
-        ValueError: for a model that :func:`filtergym.state_space` refuses.
-    """
+    """Return the estimation problem of a model and sensors, which :func:`filtergym.state_space` defines once."""
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
     kept = {name: {field: getattr(one, field) for field in fields} for name, one in sensors.items()}
-    key = id(model), *((name, *map(_key, values.values())) for name, values in kept.items())
+    plain = lambda value: id(value) if callable(value) else numpy.asarray(value).tolist()  # noqa: E731
+    key = id(model), repr([(name, [*map(plain, one.values())]) for name, one in kept.items()])
     if key not in _PROBLEMS:
         Q = model.matrix("noise")
         task = state_space(
@@ -57,30 +55,6 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
     return _PROBLEMS[key][0]
 
 
-def _key(value: Any) -> Any:
-    """Return numbers and words as text, and a function by its identity."""
-    plain = value.tolist() if isinstance(value, numpy.ndarray) else value
-    return id(value) if callable(value) else repr(plain)
-
-
-def report_estimate(model: Any, episode: Any) -> dict[str, Any]:
-    """Report a filter in one array: its mean, the same without whole turns, deviations, NIS, and whether it is lost."""
-    xp, covariance = model.task.xp, model.filter.covariance(episode.filter)
-    mean, available = model.filter.mean(episode.filter), episode.measurement.available
-    nis = model.filter.records(episode.filter, episode.measurement).get("nis", 0.0 * mean[0])
-    received, held = available[0] > 0.0, abs(mean[0]) < LARGEST
-    for one in available[1:]:
-        received = received | (one > 0.0)
-    deviations, turned = [], []
-    for i in range(mean.shape[0]):
-        held = held & (abs(mean[i]) < LARGEST) & (covariance[i, i] < LARGEST)
-        deviations.append(xp.sqrt(covariance[i, i]))
-        period = model.task.periods.get(i)
-        turned.append(mean[i] - (0.0 if period is None else period * xp.round(mean[i] / period)))
-    nis, lost = xp.where(received, nis, 0.0), xp.where(held, 0.0, 1.0)
-    return {"estimate": xp.stack([*(one for one in mean), *turned, *deviations, nis, lost])}
-
-
 def _make_filter(problem: Problem, competitor: Any, control: str | None, lanes: int) -> Any:
     """Return the model of a problem with the bank of a control, or with a competitor, in the loop."""
     scenario = find_scenario(problem.task, None, {})
@@ -90,199 +64,120 @@ def _make_filter(problem: Problem, competitor: Any, control: str | None, lanes: 
         return own
     maker = problem.find(competitor) if isinstance(competitor, str) else competitor
     if maker is None or kind_of(maker) != "estimator":
-        known = ", ".join(problem.baselines.estimators)
-        raise ValueError(f"competitor must be an estimator, one of {known}, got {competitor!r}")
+        known = f"one of {', '.join(problem.baselines.estimators)}"
+        raise ValueError(f"competitor must be an estimator, {known}, got {competitor!r}")
     return close_loop(own, maker, "estimator", str(competitor), lanes)
 
 
-class Estimates:
-    """The filters of N lanes.
+class Estimate(NamedTuple):
+    """Estimates of filters."""
+
+    mean: Array
+    """``(N, n)``, angles within half a turn."""
+    deviation: Array
+    """Standard deviations, ``(N, n)``."""
+    nis: Array
+    """Normalised innovation squared of the last readings, ``(N,)``; zero where none was received."""
+    innovation: Array
+    """Readings minus those predicted at the last estimate, ``(N, m)``; zero where none was received."""
+
+
+class Estimates(Recursion):
+    """Filters of N lanes (parallel episodes) behind their sensors.
 
     Sensors of several delays are taken in together when the last of them has come: the filter then runs as many steps
     behind, and the mean is carried to the present by the motion and the inputs since.
 
-    Args:
-        model: of the environment.
-        sensors: that read its state.
-        competitor: name of an estimator of a state-space model, such as ``"extended"``, or what makes one.
-        control: ``"noise"`` or ``"gain"``: an action multiplies these of the filter as written, in place of a
-            competitor; None: nothing does.
-        show: words of :data:`PARTS`.
-        lanes: N.
-
     Attributes:
         action_space: of the control; None without.
-
-    Raises:
-        ValueError: for an unknown competitor or control, or a model that cannot be one.
+        place, steering: where actions of the environment and of the control are written before a step.
+        shown: what is shown, ``(fields,)`` of one lane, ``(N, fields)`` of several.
+        final: the same before episodes began in the same step.
     """
 
     def __init__(
         self,
         model: EnvironmentModel,
-        sensors: Mapping[str, EnvironmentSensor],
+        readings: Readings,
         competitor: Any,
-        control: str | None,
-        show: tuple[str, ...],
-        lanes: int,
+        control: Any,
+        show: Any,
+        space: Any,
     ) -> None:
-        self._arguments = model, sensors, competitor, control, show, lanes
-        self.model: EnvironmentModel = model
-        self._lanes, self._show = lanes, show
+        super().__init__((model, readings, competitor, control, show, space), readings.lanes, readings)
+        self._model, self._show = model, show
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
-        self._own = own = _make_filter(define_problem(model, sensors), competitor, control, lanes)
+        own = _make_filter(define_problem(model, readings.sensors), competitor, control, readings.lanes)
+        if own.filter.in_python and self.lanes > 1:
+            raise ValueError(
+                f"{competitor!r} runs in Python, where lanes have one memory: wrap each environment"
+            )
         self.action_space: Any = None if control is None else own.action_space
-        is_compiled, world = can_step(own, report_estimate), own.task.world
-        self._acts: bool = not is_compiled or control is not None
-        self._update: Any = (
-            CompiledUpdate(own, report_estimate, lanes, None, self._acts, None)
-            if is_compiled
-            else ModelUpdate(own, report_estimate, lanes, world.measurement, None)
-        )
-        self._width = round_up_lanes(lanes)
-        self._pad = numpy.minimum(numpy.arange(self._width), lanes - 1)
-        self._no_action = numpy.zeros((self._width, *(own.action_space.shape or ())))
-        self._begun: Any = None
-        """Filters of all lanes at the start of an episode, made once."""
-        self._motion, self._h = (getattr(own.task.definition.filters[0], name) for name in ("f", "h"))
-        channels = own.task.definition.channels
-        self._behind = max(one.delay for one in sensors.values())
-        self._periods = numpy.array([one.period or numpy.inf for one in channels for _ in one.numbers])
-        n, m, p = len(model.names), len(self._periods), len(model.inputs)
-        self._inputs = numpy.zeros((self._behind + 2, lanes, p))
-        """Inputs of the last steps, by the clock modulo their number."""
-        self._clock, self._starts = 0, numpy.zeros(lanes, dtype=numpy.int64)
-        """Steps of all lanes, and those at the start of each one's episode."""
-        self.mean: Array = numpy.zeros((lanes, n))
-        self.deviation: Array = numpy.zeros((lanes, n))
-        self.nis: Array = numpy.zeros(lanes)
-        self.innovation: Array = numpy.zeros((lanes, m))
-        self._filtered = numpy.zeros((n, lanes))
-        """Means of the filters."""
-        self._no_inputs, self._no_interval = numpy.zeros((lanes, p)), numpy.zeros(lanes)
-        self._intervals, self._needs_innovation = numpy.full(lanes, model.interval), "innovation" in show
+        self._behind = max(one.delay for one in readings.sensors.values())
+        n, m, p, width = len(model.names), len(readings.complete) // 2, len(model.inputs), self._width
+        self._kind = space.dtype
+        taken = numpy.zeros((width, *(space.shape or ())))
+        steered = numpy.zeros((*(own.action_space.shape or ()), width))
+        self.place, self.steering = taken[self.own], steered.T[self.own]
+        mean, covariance = numpy.array(model.mean, dtype=float), model.matrix("covariance")
+        self._initial = Initial(*(numpy.repeat(one[..., None], width, axis=-1) for one in (mean, covariance)))
+        self._deviation = numpy.sqrt(numpy.diag(covariance))[:, None]
+        self._first: Any = map_arrays(lambda one: one[..., :1], own.start_filter(self._initial))
+        """State of a filter at the start of an episode."""
+        zeros = numpy.zeros((n + m, 1))
+        estimate = Estimate(zeros[:n], zeros[:n], zeros[0], zeros[:m])
+        past = numpy.zeros((self._behind, p, 1)) if p and self._behind else None
+        traced, step = None, functools.partial(self._step_of, own)
+        if isinstance(own, CompiledModel) and not own.filter.in_python:
+            traced = functools.partial(self._step_of, own.programs.traced), own.programs.graph
+        state = zeros[0], self._first, past, estimate
+        self.bind(step, traced, state, taken, readings.complete, steered)
+        self.shown: Array = self.outputs[0][self.own]
+        self.final: Array = self.shown
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, arrays and the state of the filters; their code is made anew."""
-        kinds = (numpy.ndarray, int)
-        values = {name: value for name, value in vars(self).items() if isinstance(value, kinds)}
-        return {"arguments": self._arguments, "values": values, "filters": self._update.state}
+    def _step_of(self, model: Any, given: Any, state: Any) -> tuple[Any, tuple[Array]]:
+        """Return the next state, and the parts of the estimate that are shown.
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*state["arguments"])  # type: ignore[misc]
-        vars(self).update(state["values"])
-        if state["filters"] is not None:
-            self._update.resume(state["filters"], ())
-
-    def begin(self, lanes: Array, reading: Reading) -> None:
-        """Begin episodes of some lanes with their first readings; the others stay as they are."""
-        self._restart(lanes)
-        self._starts[lanes] = self._clock
-        self._inputs[self._clock % len(self._inputs), lanes] = 0.0
-        self._take(lanes, self._no_interval, self._no_inputs, reading, None)
-
-    def _restart(self, lanes: Array) -> None:
-        model, N = self.model, self._width
-        mean = numpy.repeat(numpy.array(model.mean, dtype=float)[:, None], N, axis=1)
-        if self._begun is None:
-            covariance = numpy.repeat(model.matrix("covariance")[:, :, None], N, axis=2)
-            self._begun = self._own.start_filter(Initial(mean, covariance))
-        begun = self._begun
-        if not lanes.all():
-            begun = select_nested(lanes[self._pad], begun, self._update.state)
-        self._update.resume(begun, ())
-        self._filtered = numpy.where(lanes, mean[:, : self._lanes], self._filtered)
-
-    def advance(
-        self, lanes: Array | None, inputs: Array, reading: Reading, action: Array | None = None
-    ) -> None:
-        """Take in the readings of a step of some lanes.
-
-        Args:
-            lanes: which step, booleans ``(N,)``; None: all.
-            inputs: that acted in the step, ``(N, p)``.
-            reading: of these lanes, of one time: :attr:`.Readings.complete`.
-            action: of the control, ``(N, ...)``.
+        The state is the step of the episode, that of the filters, inputs of the last steps ``(delay, p, W)``, the
+        newest first, and the :class:`Estimate` of the present, ``(..., W)``.
         """
-        self._clock += 1
-        moves, interval = lanes, self._intervals
-        if self._behind:
-            self._inputs[self._clock % len(self._inputs)] = inputs
-            inputs = self._inputs[(self._clock - self._behind) % len(self._inputs)]
-            late = self._clock - self._starts > self._behind
-            moves = late if lanes is None else lanes & late
-        if moves is not None:
-            interval = numpy.where(moves, interval, 0.0)
-        if action is not None:
-            action = numpy.asarray(action, dtype=float)[self._pad]
-            action = action if moves is None else numpy.where(moves[self._pad][:, None], action, 0.0)
-        self._take(lanes, interval, inputs, reading, action)
-
-    def _take(
-        self, lanes: Array | None, interval: Array, inputs: Array, reading: Reading, action: Array | None
-    ) -> None:
-        """Give a measurement to the filters, and keep what they report of some lanes."""
-        values, available = reading
-        if self._lanes == 1:
-            sent = StateSpaceMeasurement(values[0], available[0], interval[0], inputs[0])
-        else:
-            sent = StateSpaceMeasurement(values.T, available.T, interval, inputs.T)
-        self._update.receive(sent if self.model.inputs else sent[:3])
-        if self._acts:
-            self._update.act(self._no_action if action is None else action)
-        n, N = len(self.model.names), self._lanes
-        found = self._update.report()["estimate"].reshape(-1, N)
-        if self._needs_innovation:
-            self._find_innovation(lanes, reading, interval, inputs.T)
-        self._filtered, shown = found[:n], found[n : 2 * n]
-        if self._behind:
-            shown = self._present()
-        new: Any = (shown.T, found[2 * n : 3 * n].T, found[3 * n])
-        if lanes is not None:
-            old = zip(new, (self.mean, self.deviation, self.nis), strict=True)
-            new = (numpy.where(lanes, one.T, other.T).T for one, other in old)
-        self.mean, self.deviation, self.nis = new
-        if numpy.count_nonzero(found[-1]):
-            lost = found[-1] > 0.0
-            self._restart(lost)
-            deviation = numpy.sqrt(numpy.diag(self.model.matrix("covariance")))
-            self.mean[lost], self.deviation[lost], self.nis[lost] = self.model.mean, deviation, 0.0
-
-    def _present(self) -> Array:
-        """Return the means of the filters carried to the present, without whole turns, ``(n, N)``."""
-        mean = self._filtered
+        (actions, phases, complete, steering), (step, before, waiting, _) = given, state
+        xp, equations, filter = model.task.xp, model.task.filter_equations[0], model.filter
+        own: Any = self._model
+        n, m, begins = len(own.names), complete.shape[0] // 2, phases > 0.0
+        past: Any = None
+        values, available = complete[:m], complete[m:]
+        if filter.in_python and begins.any():
+            model.start_filter(self._initial)  # it keeps its memory itself
+        step = xp.where(begins, 0.0, step + 1.0)
+        is_moving = (phases == 0.0) & (step > float(self._behind))
+        if own.inputs:
+            past = own.inputs_of(xp.moveaxis(xp.astype(actions, self._kind), -1, 0), xp).T[None]
+            past = past if waiting is None else xp.concat([past, waiting])
+            past = xp.where(begins, 0.0, past)
+        interval = xp.where(is_moving, own.interval, 0.0)
+        measurement = StateSpaceMeasurement(values, available, interval, past if past is None else past[-1])
+        before = select_nested(begins, self._first, before)
+        predicted = equations.measure(equations.move(filter.mean(before), measurement), measurement)
+        innovation = xp.where(available > 0.0, equations.subtract(values, predicted), 0.0)
+        action = xp.where(is_moving, steering, 0.0)
+        after = filter.update(filter.predict(before, measurement), FilterInput(measurement, None, action))
+        mean, covariance = filter.mean(after), filter.covariance(after)
+        nis = filter.records(after, measurement).get("nis", 0.0 * mean[0])
+        nis = xp.where(xp.any(available > 0.0, axis=0), nis, 0.0)
+        variances = xp.stack([covariance[i, i] for i in range(n)])
+        is_kept = xp.all((xp.abs(mean) < LARGEST) & (variances < LARGEST), axis=0)
         for back in range(self._behind - 1, -1, -1):
-            going = numpy.where(self._clock - self._starts > back, self.model.interval, 0.0)
-            mean = self._motion_of(mean, going, self._inputs[(self._clock - back) % len(self._inputs)].T)
-        for i, period in self._own.task.periods.items():
-            mean[i] -= period * numpy.rint(mean[i] / period)
-        return mean
-
-    def _find_innovation(self, lanes: Array | None, reading: Reading, interval: Array, inputs: Array) -> None:
-        """Compare readings with those predicted at the last estimate."""
-        predicted = self._motion_of(self._filtered, interval, inputs)
-        innovation = reading.values - numpy.asarray(self._h.value(predicted, numpy)).T
-        for i in numpy.flatnonzero(self._periods < numpy.inf):
-            innovation[:, i] -= numpy.rint(innovation[:, i] / self._periods[i]) * self._periods[i]
-        innovation = numpy.where(reading.available, innovation, 0.0)
-        kept = innovation if lanes is None else numpy.where(lanes[:, None], innovation, self.innovation)
-        self.innovation = kept
-
-    def _motion_of(self, mean: Array, interval: Array, inputs: Array) -> Array:
-        """Return states ``(n, N)`` an interval later."""
-        return numpy.asarray(self._motion.value(numpy.concatenate([mean, interval[None], inputs]), numpy))
-
-    def space(self, dtype: Any) -> gymnasium.spaces.Box:
-        """Return the space of what is shown of one lane."""
-        return gymnasium.spaces.Box(-numpy.inf, numpy.inf, self.show(dtype).shape[1:], dtype)
-
-    def show(self, dtype: Any) -> Array:
-        """Return what is shown, ``(N, fields)``."""
-        parts = []
-        for name in self._show:
-            if name == "observation":
-                parts.append(self.model.observation(self.mean))  # type: ignore[misc]
-            else:
-                parts.append(self.nis[:, None] if name == "nis" else getattr(self, name))
-        return (parts[0] if len(parts) == 1 else numpy.concatenate(parts, axis=1)).astype(dtype, order="C")
+            going = xp.where(step > float(back), own.interval, 0.0)
+            mean = equations.move(mean, Passage(going, None if past is None else past[back]))
+        mean = xp.where(is_kept, shorten(mean, model.task.periods), self._initial.mean[:, :1])
+        deviation = xp.where(is_kept, xp.sqrt(variances), self._deviation)
+        estimate = Estimate(mean, deviation, xp.where(is_kept, nis, 0.0), innovation)
+        after = select_nested(is_kept, after, self._first)
+        found = step, after, None if past is None or waiting is None else past[:-1], estimate
+        found = select_nested(phases >= 0.0, found, state)
+        parts = {**found[-1]._asdict(), "nis": found[-1].nis[None]}
+        if "observation" in self._show:
+            parts["observation"] = xp.asarray(own.observation(parts["mean"].T)).T
+        return found, (xp.concat([parts[name] for name in self._show]),)

@@ -36,9 +36,6 @@ def fit_model(
         angles: components that are angles, by their names; they turn without limit in the fit.
         seed: of the rollouts.
 
-    Returns:
-        The model.
-
     Raises:
         ValueError: for an observation or an action that is no vector, or too few steps.
     """
@@ -49,9 +46,7 @@ def fit_model(
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
     features = 1 + n + p + (n + p) * (n + p + 1) // 2 * (degree == 2)
     if degree not in (1, 2) or steps < 10 * features:
-        raise ValueError(
-            f"degree must be 1 or 2, and steps at least {10 * features:,}, got {degree} and {steps:,}"
-        )
+        raise ValueError(f"degree must be 1 or 2, steps at least {10 * features}, got {degree} and {steps}")
     before, after, action, starts = _roll_out(env, steps, policy, seed)
     change = after - before
     for name, unit in (angles or {}).items():
@@ -75,9 +70,8 @@ def fit_model(
     def f(x: Any, dt: Any, u: Any) -> list[Any]:
         found = terms([*(x[i] for i in range(n)), *(u[j] for j in range(p))])
         share = dt / interval
-        return [
-            x[i] + share * sum(float(weights[k, i]) * one for k, one in enumerate(found)) for i in range(n)
-        ]
+        change = [sum(float(weights[k, i]) * one for k, one in enumerate(found)) for i in range(n)]
+        return [x[i] + share * change[i] for i in range(n)]
 
     return EnvironmentModel(
         names=names, f=f, interval=interval, noise=noise, mean=starts.mean(axis=0),

@@ -56,15 +56,18 @@ class EnvironmentModel:
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle a model of :data:`CLASSIC_CONTROL` by its name."""
-        for name, model in CLASSIC_CONTROL.items():
-            if model is self:
-                return find_model, (name, None)
-        return super().__reduce_ex__(protocol)
+        names = [name for name, model in CLASSIC_CONTROL.items() if model is self]
+        return (find_model, (names[0], None)) if names else super().__reduce_ex__(protocol)
 
     def matrix(self, name: str) -> Array:
         """Return ``noise`` or ``covariance`` as a matrix, ``(n, n)``."""
         given = numpy.asarray(getattr(self, name), dtype=float)
         return numpy.diag(given) if given.ndim == 1 else given
+
+    def inputs_of(self, actions: Any, xp: Any = numpy) -> Any:
+        """Return the inputs ``(N, p)`` of actions ``(N, ...)``, arrays of a namespace."""
+        found = xp.asarray(actions if self.action is None else self.action(actions))
+        return xp.reshape(xp.astype(found, xp.float64), (actions.shape[0], -1))
 
 
 def _cart_pole(x: Any, dt: Any, u: Any) -> list[Any]:
@@ -136,7 +139,7 @@ CLASSIC_CONTROL = {
             [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]]).T,
         observation=lambda x: numpy.array(
             [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]]).T,
-        action=lambda action: numpy.asarray(action, dtype=float)[:, None] - 1.0,
+        action=lambda action: action[:, None] - 1.0,
     ),
 }  # fmt: skip
 """Models by the names of Gymnasium's environments, without versions."""
@@ -149,28 +152,22 @@ def find_model(model: Any, spec: Any) -> EnvironmentModel | None:
         model: an :class:`EnvironmentModel`; a name of :data:`CLASSIC_CONTROL`, with or without a version;
             ``"module:attribute"`` of one of yours, which is imported; or None.
         spec: of the environment, or None.
-
-    Raises:
-        ValueError: for any other name.
     """
     if isinstance(model, EnvironmentModel):
         return model
-    name = model if model is not None else getattr(spec, "id", None)
-    if name is None:
-        return None
-    if isinstance(name, str):
-        module, colon, attribute = name.partition(":")
-        if colon and model is not None:
-            found = getattr(importlib.import_module(module), attribute, None)
-            if isinstance(found, EnvironmentModel):
-                return found
-        found = CLASSIC_CONTROL.get(name.rpartition("/")[2].rpartition("-v")[0] or name)
-        if found is not None and model is None and spec.kwargs.get("g", 10.0) != 10.0:
+    name = str(getattr(spec, "id", "") if model is None else model)
+    found: Any = CLASSIC_CONTROL.get(name.rpartition("/")[2].rpartition("-v")[0] or name)
+    if model is None:
+        if found is not None and spec.kwargs.get("g", 10.0) != 10.0:
             raise ValueError(
                 f"the model of {name} is that of g = 10, and this one has g = {spec.kwargs['g']}: give model="
             )
-        if found is not None or model is None:
-            return found
+        return found
+    module, colon, attribute = name.partition(":")
+    if colon:
+        found = getattr(importlib.import_module(module), attribute, None)
+    if isinstance(found, EnvironmentModel):
+        return found
     raise ValueError(
         f"model must be an EnvironmentModel, 'module:attribute' of one, or one of {', '.join(CLASSIC_CONTROL)}, got "
         f"{model!r}"

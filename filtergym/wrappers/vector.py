@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from .lanes import FilterLanes, SensorLanes, autoreset_of, rows_of
+from .lanes import FilterLanes, SensorLanes, rows_of
 
 __all__ = ["EstimatedObservation", "NoisyObservation"]
 
@@ -19,7 +19,7 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], sensors: Any, model: Any = None) -> None:
         super().__init__(env, sensors, model)
-        self._mode: AutoresetMode = autoreset_of(env)
+        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._every = numpy.ones(env.num_envs, dtype=bool)
         self._ended = ~self._every
         """Lanes whose episode ended in the last step, and that have not begun anew."""
@@ -27,33 +27,38 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin episodes of the environments, of some alone with the option ``reset_mask``, and their readings."""
+        """Begin episodes, of some environments alone with the option ``reset_mask``, and return their readings."""
         mask = (options or {}).get("reset_mask")  # Gymnasium takes it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         lanes = self._every if mask is None else numpy.asarray(mask, dtype=bool)
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        self.events, self._ended = [], self._ended & ~lanes
-        return self._begin(lanes, observations, seeds), self._with_available(infos)
+        self._ended = self._ended & ~lanes
+        values, available = self._read(observations, lanes, ~self._every, seeds)
+        return values, self._with_available(infos, available)
 
     def step(self, actions: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
         """Step the environments, and read the sensors."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         ended, begins = numpy.logical_or(terminations, truncations), self._ended
-        if self._mode is not AutoresetMode.SAME_STEP:
-            values = self._advance(~begins if begins.any() else None, observations)
-            self._ended = ended
-        elif ended.any():
+        if self._mode is AutoresetMode.SAME_STEP and ended.any():
             finals = zip(infos["final_obs"], ended, observations, strict=True)
-            values = self._advance(None, numpy.stack([last if was else now for last, was, now in finals]))
-            infos, begins = {**infos, "final_obs": rows_of(ended, values)}, ended
+            values, available = self._read(numpy.stack([last if was else now for last, was, now in finals]))
+            infos = {**infos, "final_obs": rows_of(ended, values)}
+            for one in self._readings.followers:
+                one.final = one.shown.copy()
+            values, begun = self._read(observations, ended, ~self._every)
+            available = numpy.where(ended[:, None], begun, available)
+        elif begins.any():
+            is_begun = begins & (self._mode is AutoresetMode.NEXT_STEP)
+            values, available = self._read(observations, is_begun, ~begins)
         else:
-            values = self._advance(None, observations)
-        if self._mode is not AutoresetMode.DISABLED and begins.any():
-            values = self._begin(begins, observations, None, self.reading.available)
-        return values, rewards, terminations, truncations, self._with_available(infos)
+            values, available = self._read(observations)
+        if self._mode is not AutoresetMode.SAME_STEP:
+            self._ended = ended
+        return values, rewards, terminations, truncations, self._with_available(infos, available)
 
-    def _with_available(self, infos: dict[str, Any]) -> dict[str, Any]:
-        return {**infos, "available": self.reading.available.copy(), "_available": self._every.copy()}
+    def _with_available(self, infos: dict[str, Any], available: numpy.ndarray) -> dict[str, Any]:
+        return {**infos, "available": available, "_available": self._every.copy()}
 
 
 class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
@@ -62,20 +67,3 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     A lane has the estimates, bit for bit, that a single environment of its seed has. With autoreset in the same step
     ``infos["final_obs"]`` holds the last estimate of an episode.
     """
-
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Begin episodes, and the filters of these lanes."""
-        _, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        self._take(None, None)
-        return self._shown(), infos
-
-    def step(self, actions: Any) -> tuple[numpy.ndarray, Any, Any, Any, dict[str, Any]]:
-        """Step the environments, and take their readings in."""
-        actions, own = self._split(actions)
-        _, rewards, terminations, truncations, infos = self.env.step(actions)
-        last = self._take(actions, own)
-        if last is not None and autoreset_of(self.env) is AutoresetMode.SAME_STEP:
-            infos = {**infos, "final_obs": rows_of(infos["_final_obs"], last)}
-        return self._shown(), rewards, terminations, truncations, infos
