@@ -222,7 +222,7 @@ def test_who_cannot_teach_is_refused(id, overrides, message):
     algorithm = NAME if id == RADAR else "bptt"
     run = new_run(problem_of(id), RunOptions(algorithm, envs=2, overrides=overrides))
     with pytest.raises(ValueError, match=message):
-        Descent(run).flight()
+        Descent(run).episode_function()
 
 
 def test_units_of_a_memory_forget_over_one_to_the_longest_number_of_decisions():
