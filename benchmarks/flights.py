@@ -1,7 +1,7 @@
 """All available sets of real flights, raw and smoothed, as a test of competitors beyond simulated flights.
 
     pip install --no-deps traffic
-    python benchmarks/flights.py --out docs/data/flights.csv
+    FILTERGYM_READ_MEMORY=1024 python benchmarks/flights.py --out docs/data/flights.csv
 
 The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
 least ``FEWEST`` flights is a set of its own; the other samples of its folder are one set if they have as many together,
@@ -37,6 +37,8 @@ COMPETITORS = (
     "kalman-imm-tuned",
     "imm-tuned",
     "adaptive-rearm-tuned",
+    "bptt-strongest",
+    "bptt-small",
     "kalman-net",
     "bptt",
     "ppo",

@@ -124,9 +124,9 @@ $(DONE)/coverage: $(call after,$(patsubst %,$(DONE)/ship-%,ManeuveringTarget Loo
 
 $(DONE)/flights: $(call after,$(DONE)/ship-ManeuveringTarget)
 	$(BIN)/python -m pip install --quiet --no-deps traffic
-	$(BIN)/python benchmarks/flights.py --out docs/data/flights.csv > build/flights.txt
+	FILTERGYM_READ_MEMORY=1024 $(BIN)/python benchmarks/flights.py --out docs/data/flights.csv > build/flights.txt
 	$(table) build/flights.txt --name flights_smoothed --name flights_recorded \
-	  --command "python benchmarks/flights.py --out docs/data/flights.csv"
+	  --command "FILTERGYM_READ_MEMORY=1024 python benchmarks/flights.py --out docs/data/flights.csv"
 	$(finish)
 
 $(DONE)/plain:
