@@ -360,5 +360,5 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
 
 
 def pretrained_path(id: str, name: str) -> Path:
-    """Return the path of a shipped agent for a Gymnasium id; the file need not exist."""
+    """Return the path of the shipped agent of a name for a Gymnasium id; the file need not exist."""
     return PRETRAINED / short_name(id) / f"{name}.safetensors"

@@ -121,9 +121,7 @@ class FittedLog:
 
     @cached_property
     def stretches(self) -> list[Span] | None:
-        """Beginnings of the blocks for the fit, with ``COARSE`` measurements in all; None for a short
-        recording.
-        """
+        """Spans of the first part of each block, ``COARSE`` measurements in all; None for a short recording."""
         total = sum(span.last - span.first for span in self.share.fitted)
         if total < 2 * COARSE:
             return None

@@ -434,7 +434,7 @@ def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
-    """Make the table of baselines for a user's state-space model."""
+    """Return the baselines of a task class made from a user's state-space model: policies, estimators, a smoother."""
     several = len(task.definition.filters) > 1
     linear = all(model.is_linear for model in task.definition.filters)
     policies: dict[str, Any] = {

@@ -25,7 +25,7 @@ class FormingFilter(NamedTuple):
 
 
 def vertical_gust(airspeed: float, length: float, sigma: float) -> FormingFilter:
-    """Return the first-order forming filter of the vertical gust, as an angle of attack in degrees.
+    """Return bandwidth, deviation and noise intensity of the first-order vertical gust, an angle of attack in degrees.
 
     Args:
         airspeed: V, m/s.

@@ -42,7 +42,7 @@ def chain(stay: float) -> tuple[tuple[float, ...], ...]:
 
 
 class Sticky(MultiHypothesis):
-    """The paper's algorithm over a chain that leaves a hypothesis once in 100 s, not once in 5 s.
+    """The paper's algorithm for a task whose chain leaves a hypothesis once in 100 s, not once in 5 s.
 
     An evaluation sets the task's ``transition``; elsewhere the user sets it.
     """

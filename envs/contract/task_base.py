@@ -30,7 +30,7 @@ class NoiseLayout(NamedTuple):
 
 
 class TaskBase(ABC):
-    """Base class that derives from a task's declaration its world, its constants and the course of episodes.
+    """Base class of a task: makes its world, simulated or replayed, and fixes lengths and random numbers of episodes.
 
     The author of a task writes only the declaration, :class:`~.task.Task`.
 

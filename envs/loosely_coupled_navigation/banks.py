@@ -502,7 +502,7 @@ class SchemeBank(KalmanBucyBank):
         )
 
     def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:
-        """Return every filter updated with its own Kalman gain, and the weights of the action."""
+        """Return the state: every filter updated with its own gain, and the weights that the action sets or selects."""
         xp, available, innovation = self.xp, measurement.available, state.innovations.innovation
         R = measurement.reported_deviation * measurement.reported_deviation
         plain = state.plain_variance

@@ -147,7 +147,7 @@ class Bootstrap:
         return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
     def weights_of(self, part: slice) -> numpy.ndarray:
-        """Return the weights of a slice of episodes or groups, ``(1 + resamples, some)``; the last are cached."""
+        """Return the weights of a slice of episodes in the means of data and resamples, ``(1 + resamples, some)``."""
         if self._last is None or self._last[0] != part:
             self._last = None  # so that only one block of weights is in memory
             which = part if self._clusters is None else self._clusters[part]

@@ -78,7 +78,7 @@ def loss_verdict(increment: Loss, kinematic: Loss) -> Verdict:
 
 
 def adaptation_verdict(with_rates: Sequence[Wait], without: Wait) -> Verdict:
-    """Return the verdict on "adaptation takes 0.01 to 0.45 s".
+    """Return the verdict on "adaptation takes 0.01 to 0.45 s": every mean lies in this band, and they fill it.
 
     Reproduced if every mean lies within the band and the band is filled: one step at the lower end, and at the
     upper end at least two thirds of 0.45 s, with all sensors in use; in part if without rates only.
