@@ -5,9 +5,9 @@ the rest is the same everywhere. With U the rotation into the frame, s the unit 
 motion output and nu the innovation over the sensor's sigma, zero where nothing was received,
 
     predict   x' = f(x, m)
-    update    x = x' + U^T diag(s) c,  c_i = G_i (nu_j + sum_k a_ik nu_k + offset_reach a_i),  k other than j motion
-    m_l = G_i a_l report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_ii,  L_ij = coupling_reach L_ii
-    a_ij  (j < i)
+    update    x = x' + U^T diag(s) c,  c_i = G_i (nu_j + sum_k a_ik nu_k + offset_reach a_i),  k other than j
+    motion    m_l = G_i a_l
+    report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_ii,  L_ij = coupling_reach L_ii a_ij  (j < i)
 
 with a in [-1, 1] the network's outputs, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach
 a) and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are output as logits,
