@@ -17,6 +17,7 @@ from filtergym.wrappers import (
     EnvironmentSensor,
     EstimatedObservation,
     NoisyObservation,
+    estimates,
     fit_model,
     vector,
 )
@@ -597,3 +598,36 @@ def test_a_loop_of_ppo_in_one_file_needs_no_special_case():
             returns += infos["episode"]["r"][infos["_episode"]].tolist()
     assert np.isfinite(storage).all()
     assert returns
+
+
+def test_observations_that_are_not_finite_are_not_received():
+    """A filter bridges them, with or without a control, and a lane that overflows begins anew."""
+    sensors = {"encoder": {"h": ["position", "angle"], "R": 1e-4}}
+    for control in (None, "noise"):
+        steps = iter(range(99))
+        broken = gymnasium.wrappers.TransformObservation(
+            gymnasium.make("CartPole-v1"), lambda o, steps=steps: o * np.nan if next(steps) == 5 else o, None
+        )
+        env = EstimatedObservation(NoisyObservation(broken, sensors), control=control)
+        env.reset(seed=0)
+        zero = np.zeros(()) if control is None else np.zeros(env.action_space[1].shape)
+        received = []
+        for step in range(9):
+            action = step % 2 if control is None else (step % 2, zero)
+            observation, *_, info = env.step(action)
+            received.append(bool(info["available"].all()))
+            assert np.isfinite(observation).all()
+        assert received == [step != 4 for step in range(9)]
+        assert env.estimates.nis > 0.0
+
+
+def test_copies_define_no_further_problem():
+    model = EnvironmentModel(("x",), lambda x, dt: [x[0]], 1.0, [1.0], [0.0], [1.0])
+    sensors = {"s": EnvironmentSensor(h=[[1.0]], R=[[1.0]])}
+    first = estimates.define_problem(model, sensors)
+    assert estimates.define_problem(copy.deepcopy(model), copy.deepcopy(sensors)) is first
+
+
+def test_a_fit_needs_more_episodes_than_components():
+    with pytest.raises(ValueError, match="rollouts of 3 components need 4 episodes, got 1"):
+        fit_model(gymnasium.make("Pendulum-v1").unwrapped, steps=400)

@@ -60,7 +60,7 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
         own = self._readings
         own.place[...] = observation
         own.run()
-        info["available"] = own.available.astype(bool) if own.always is None else own.always.copy()
+        info["available"] = own.available.astype(bool)
         return own.values.astype(self._dtype), reward, terminated, truncated, info
 
 

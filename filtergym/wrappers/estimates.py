@@ -33,7 +33,7 @@ LARGEST = 1e38
 """Mean or variance of a filter that is lost, as observations of 32 bits cannot hold more: it begins anew."""
 CONTROLS = ("noise", "gain")
 """What an action may change of the filter."""
-_PROBLEMS: dict[tuple[Any, ...], tuple[Problem, Any]] = {}
+_PROBLEMS: dict[str, tuple[Problem, Any]] = {}
 """State-space models of this process, with the objects by which they are found."""
 
 
@@ -42,7 +42,8 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
     kept = {name: {field: getattr(one, field) for field in fields} for name, one in sensors.items()}
     plain = lambda value: id(value) if callable(value) else numpy.asarray(value).tolist()  # noqa: E731
-    key = id(model), repr([(name, [*map(plain, one.values())]) for name, one in kept.items()])
+    own = [plain(getattr(model, field.name)) for field in dataclasses.fields(model)]
+    key = repr((own, [(name, [*map(plain, one.values())]) for name, one in kept.items()]))
     if key not in _PROBLEMS:
         Q = model.matrix("noise")
         task = state_space(
@@ -168,6 +169,7 @@ class Estimates(Recursion):
         nis = xp.where(xp.any(available > 0.0, axis=0), nis, 0.0)
         variances = xp.stack([covariance[i, i] for i in range(n)])
         is_kept = xp.all((xp.abs(mean) < LARGEST) & (variances < LARGEST), axis=0)
+        is_kept = is_kept & (getattr(after, "fault", 0.0 * step) == 0.0)
         for back in range(self._behind - 1, -1, -1):
             going = xp.where(step > float(back), own.interval, 0.0)
             mean = equations.move(mean, Passage(going, None if past is None else past[back]))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy
 
-Array = numpy.ndarray
+from .recursions import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,7 +124,7 @@ class Readings(Recursion):
     Attributes:
         limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
         values: of the last step, ``(m,)`` of one lane, ``(N, m)`` of several.
-        available, always: 1 where they were received, else 0; and the same for every step, None where it may differ.
+        available: 1 where they were received, else 0.
         place: where observations are written before a step, ``(fields,)`` or ``(N, fields)``.
         complete: readings of the last time of which those of all sensors, the slowest too, have been received, and
             behind them 1 where they were made, ``(2 m, W)``.
@@ -167,7 +167,6 @@ class Readings(Recursion):
         self.complete, available, values = self.outputs
         self.place, self.values = observation[self.own], values[self.own]
         self.available: Array = available.T[self.own]
-        self.always = None if late or not is_steady else numpy.ones(self.available.shape, dtype=bool)
 
     def begin(self, begins: Array, steps: Array, seeds: Any = None) -> None:
         """Set the seeds of episodes, and begin them, see :meth:`.Recursion.begin`.
@@ -214,6 +213,7 @@ class Readings(Recursion):
         quanta = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
         values = xp.where(self._quantum > 0.0, xp.round(values / quanta) * quanta, values)
         values = shorten(values, self._periods)
+        values = xp.where(is_finite := xp.isfinite(values), values, 0.0)
         step, rows = xp.where(begins, 0.0, step + 1.0), []
         for place, channel in enumerate(self._channels):
             due = begins | is_active
@@ -223,7 +223,7 @@ class Readings(Recursion):
                 share = self._interval / channel.interval
                 due = due & (xp.floor(step * share + EARLY) > xp.floor((step - 1.0) * share + EARLY))
             rows += [xp.where(begins | due, 1.0, 0.0)] * channel.size
-        now = xp.stack([values, xp.stack(rows)])[None]
+        now = xp.stack([values, xp.where(is_finite, xp.stack(rows), 0.0)])[None]  # else not received
         if waiting is not None:
             now = xp.concat([now, xp.where(begins, 0.0, waiting)])
             waiting = now[:-1]
