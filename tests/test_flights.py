@@ -3,6 +3,7 @@
 import datetime
 import gzip
 import importlib
+import importlib.util
 import json
 import runpy
 from pathlib import Path
@@ -157,9 +158,11 @@ def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flo
 
 
 def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
+    with monkeypatch.context() as absent:
+        absent.setattr(importlib.util, "find_spec", lambda name: None)  # whether or not it is installed here
+        with pytest.raises(ValueError, match=r"is not installed; .* pip install --no-deps"):
+            make_model(ID, scenario="traffic:quickstart")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ValueError, match=r"is not installed; .* pip install --no-deps"):
-        make_model(ID, scenario="traffic:quickstart")
     folder = tmp_path / "traffic" / "data" / "samples" / "collections"
     folder.mkdir(parents=True)
     (tmp_path / "traffic" / "__init__.py").write_text("raise ImportError('of a long chain of libraries')")
