@@ -47,6 +47,13 @@ KNOWN = {
 """Parts that a part may import, of those that know few."""
 MOST_LINES = 35_300
 """Of the core; it was 36,700 before docstrings of private helpers went."""
+CIRCLES: set[frozenset[str]] = {
+    frozenset({"compiler/namespace.py", "compiler/numpy_functions.py"}),
+}
+"""Files that import one another, also where an import is late or for types alone: the methods by which NumPy calls a
+traced array are written with the functions of the namespace that returns such arrays."""
+TYPES_ALONE = Path("filtergym/__init__.py")
+"""Names the functions of the package for type checkers, and imports them when they are first used."""
 
 
 def part_of(file: Path) -> str:
