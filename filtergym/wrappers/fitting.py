@@ -48,8 +48,8 @@ def fit_model(
     if degree not in (1, 2) or steps < 10 * features:
         raise ValueError(f"degree must be 1 or 2, steps at least {10 * features}, got {degree} and {steps}")
     before, after, action, starts = _roll_out(env, steps, policy, seed)
-    if len(starts) <= n:
-        raise ValueError(f"rollouts of {n} components need {n + 1} episodes, got {len(starts)}: more steps")
+    if (count := len(starts)) <= n:
+        raise ValueError(f"rollouts of {n} components need {n + 1} episodes, got {count}: take more steps")
     change = after - before
     for name, unit in (angles or {}).items():
         turn = {"rad": 2.0 * numpy.pi, "deg": 360.0}[unit]
